@@ -1,20 +1,20 @@
-"""Eigenvectors of the Hessian's blocks of single Gaussians: start vectors for a search of the ends of the spectrum.
+"""Eigenvectors of the Hessian's diagonal blocks of Gaussians: start vectors for a search of both ends of the spectrum.
 
-Steep eigenvectors of a scene have their weight on one or two Gaussians, and the block of a Gaussian's geometry and opacity is
-known (`PerGaussianBlocks`).  Its eigenvectors, at right angles to the quaternion as in `SceneHessian`, are near them.
+Eigenvectors of a scene with extreme eigenvalues have their weight on one or two Gaussians.  So those of a Gaussian's block of
+geometry and opacity (`PerGaussianBlocks`), orthogonal to the quaternion as in `SceneHessian`, are close to them.
 
-Coupling of pixels.  Approximate blocks have the diagonal of SSIM's l'' only, too much: SSIM is blind to even changes of a
-window.  The window's blur B (a Gaussian, standard deviation sigma px) keeps the share rho = |B u|^2 / |u|^2 of an image u, and
-that share of the pixelwise part has to go.  A splat that moves across its narrower axis changes the image by the slope of a
-Gaussian, so with its conic C (px^-2) and the larger eigenvalue c of C
+Coupling of pixels.  Approximate blocks have the diagonal of SSIM's l'' alone.  They are too large, because SSIM ignores changes
+that are uniform over a window.  The window's blur B (a Gaussian, standard deviation sigma px) keeps the share
+rho = |B u|^2 / |u|^2 of an image u; this share of the pixelwise part is removed.  A splat that moves across its narrower axis
+changes the image by the slope of a Gaussian, so with its conic C (px^-2) and the larger eigenvalue c of C
 
     rho = 1 / ((1 + sigma^2 c) sqrt(det(1 + sigma^2 C)))
 
-averaged over the views that draw it.  (1 - rho) / (1 - rho_1) of the pixelwise part is kept; rho_1 is that of a single pixel,
-which the diagonal of l'' leaves out already.  Of the curvature of an L2 loss beside SSIM, too much is removed.
+averaged over the views that draw it.  The share (1 - rho) / (1 - rho_1) of the pixelwise part is kept; rho_1 is that of a
+single pixel, which the diagonal of l'' leaves out already.  Of the curvature of an L2 loss beside SSIM this removes too much.
 
-Start vectors.  A Krylov method that starts at the steepest eigenvector alone can miss an extreme one it has no component in, so
-the start is a sum of several (WARM_START) of either end.
+Start vectors.  A Krylov method that starts at one eigenvector misses every extreme eigenvector that is orthogonal to it, so it
+is given several (WARM_START) from either end.
 """
 
 from math import inf, pi
@@ -32,19 +32,19 @@ from splat.projection.dispatch import projected
 from splat.projection.formulas import lens_of
 
 RHO_OF_A_PIXEL = 1 / (4 * pi * SIGMA**2)
-CHUNK = 8192  # Gaussians at a time: CUDA refuses 32,768 blocks and takes up to 1 MB of memory for each
+CHUNK = 8192  # blocks decomposed at a time: CUDA refuses 32,768, and takes up to 1 MB of memory for each
 WARM_START = 2, 4  # eigenvectors of the largest and of the smallest eigenvalues; negative ones lie closer together
-FEW = 256  # Gaussians whose blocks are eigendecomposed in any case
-BOUND_SLACK = 1e-5  # relative, for the rounding of a norm
+FEW = 256  # blocks that are decomposed in any case
+BOUND_SLACK = 1e-5  # relative rounding error of a norm
 # eigenvalues, the Gaussians that they belong to, and eigenvectors
 Ends = tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]
 
 
 class BlockEigenvectors:
-    """Eigenpairs of the Gaussians' blocks of the scene's Hessian H, or of D H D.
+    """Eigenpairs of the Gaussians' diagonal blocks of the scene's Hessian H, or of D H D.
 
-    blocks: of H, or of its Gauss-Newton part.  pixelwise: of the Gauss-Newton part with the diagonal of l'', where the loss
-    couples pixels.  attribute: one other than "sh"; by default all but "sh".  scale: D > 0, 1 by default.
+    blocks: of H, or of its Gauss-Newton part.  pixelwise: blocks of the Gauss-Newton part with the diagonal of l'', where the
+    loss couples pixels.  attribute: one other than "sh"; by default all but "sh".  scale: diagonal of D > 0, 1 by default.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class BlockEigenvectors:
         self._geometry, self._radial, self._units = geometry, radial, units
 
     def pairs(self, gaussians: Int[Tensor, " m"]) -> tuple[Float64[Tensor, "m w"], Float[Tensor, "m w w"]]:
-        """Eigenvalues of these Gaussians' blocks, ascending, and eigenvectors, in columns; a quaternion's length has 0."""
+        """Ascending eigenvalues and eigenvectors (in columns) of these Gaussians' blocks; 0 for a quaternion's length."""
         return eigendecomposed(*(x[gaussians] for x in (self._geometry, self._radial, self._units)))
 
     def steepest(self, largest: int, smallest: int) -> Float[Tensor, "p k"]:
@@ -91,10 +91,10 @@ class BlockEigenvectors:
         return self.steepest(*WARM_START)
 
     def _ends(self, largest: int, smallest: int) -> Ends:
-        """The steepest eigenpairs, found by eigendecomposition of few blocks.
+        """The extreme eigenpairs of all blocks, by eigendecomposition of as few as possible.
 
-        No eigenvalue is larger than its block's Frobenius norm.  Once some of the largest blocks are known, those whose norm is
-        below the ends found so far need no look.
+        No eigenvalue exceeds its block's Frobenius norm in size.  So, with the extremes of the blocks of largest norm known,
+        blocks of a norm below all of these are skipped.
         """
         bounds = (self._geometry * self._units[:, :, None] * self._units[:, None, :]).flatten(1).norm(dim=1)
         some = bounds.topk(min(max(FEW, largest, smallest), len(bounds))).indices
@@ -106,10 +106,10 @@ class BlockEigenvectors:
     def _ends_of(self, gaussians: Int[Tensor, " m"], largest: int, smallest: int) -> Ends:
         """The largest eigenpairs of these blocks, descending, and the smallest, ascending."""
         values, vectors = self.pairs(gaussians)
-        length = vectors.norm(dim=1) < 0.5  # projected out: the quaternion's
-        most, width = int((~length).sum()), values.shape[1]
-        top = values.masked_fill(length, -inf).flatten().topk(min(largest, most)).indices
-        bottom = values.masked_fill(length, inf).flatten().topk(min(smallest, most), largest=False).indices
+        null = vectors.norm(dim=1) < 0.5  # the quaternion's length, which `eigendecomposed` projects out
+        most, width = int((~null).sum()), values.shape[1]
+        top = values.masked_fill(null, -inf).flatten().topk(min(largest, most)).indices
+        bottom = values.masked_fill(null, inf).flatten().topk(min(smallest, most), largest=False).indices
         chosen = torch.cat([top, bottom])
         block = chosen // width
         return values.flatten()[chosen], gaussians[block], vectors[block, :, chosen % width]
@@ -135,12 +135,12 @@ def eigendecomposed(
 
 
 def _across(r: Float64[Tensor, "n w 1"], B: Float64[Tensor, "n w w"]) -> Float64[Tensor, "n w w"]:
-    """The part of B's columns at right angles to the unit vectors r."""
+    """B's columns without their components along the unit vectors r."""
     return B - r * (r * B).sum(dim=1, keepdim=True)
 
 
 def _kept_share(objective: SceneObjective) -> Float64[Tensor, " n"]:
-    """The share of each Gaussian's pixelwise part that SSIM's window leaves."""
+    """(1 - rho) / (1 - rho_1) of each Gaussian, rho averaged over the views that draw it."""
     views = torch.stack([_blurred_share(objective, view.camera) for view in objective.views])
     rho, drawn = objective.mean_over_views(views.sum(dim=0))
     return (1 - rho / drawn) / (1 - RHO_OF_A_PIXEL)

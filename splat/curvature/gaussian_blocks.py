@@ -1,4 +1,7 @@
-"""Diagonal blocks of a Hessian, one a Gaussian: 11 x 11 of its geometry and opacity, and the diagonal of its SH."""
+"""Diagonal blocks of a Hessian, one for each Gaussian: 11 x 11 for geometry and opacity, and the diagonal for SH.
+
+Rows and columns are stored parameters: mean, log-scales, quaternion w x y z, opacity logit.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +22,7 @@ GEOMETRY_COLUMNS = {
 class PerGaussianBlocks(Brief):
     """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH.
 
-    views: where the blocks are the mean over views, `traces` of each view's, in order, if they were asked for.
+    views: of blocks that are a mean over views, `traces` of each view's blocks, or nothing.
     """
 
     geometry: Float[Tensor, "n 11 11"]
@@ -27,17 +30,17 @@ class PerGaussianBlocks(Brief):
     views: Sequence[Mapping[str, float]] = ()
 
     def add(self, other: "PerGaussianBlocks") -> None:
-        """Add another's blocks to these, in their place."""
+        """Add other blocks in place."""
         self.geometry.add_(other.geometry)
         self.sh.add_(other.sh)
 
     def add_diagonal(self, parts: Mapping[str, Float[Tensor, "n ..."]]) -> None:
-        """Add numbers of attributes in GEOMETRY_COLUMNS to the blocks' diagonals, in their place."""
+        """Add a diagonal, given by attribute in GEOMETRY_COLUMNS, in place."""
         for name, part in parts.items():
             self.geometry.diagonal(dim1=1, dim2=2)[:, GEOMETRY_COLUMNS[name]] += part.view(len(part), -1)
 
     def apply(self, V: Float[Tensor, "p k"], gaussians: Gaussians) -> Float[Tensor, "p k"]:
-        """B V of vectors over the parameters of these Gaussians."""
+        """B V, the columns of V laid out like `gaussians.flat`."""
         rows, result = gaussians.blocks, torch.empty_like(V)
         n, vectors = len(gaussians), V.shape[1]
         parts = [V[rows[name]].view(n, -1, vectors) for name in GEOMETRY_COLUMNS]
@@ -48,7 +51,7 @@ class PerGaussianBlocks(Brief):
         return result
 
     def across(self, quats: Float[Tensor, "n 4"]) -> "PerGaussianBlocks":
-        """P B P, where P projects out the unit quats."""
+        """P B P, where P projects out the unit quaternions quats."""
         q = self.geometry.new_zeros(len(quats), 11, 1)
         q[:, GEOMETRY_COLUMNS["quats"], 0] = quats.to(q)
         half = self.geometry - q @ (q.mT @ self.geometry)
@@ -57,7 +60,7 @@ class PerGaussianBlocks(Brief):
     def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
         """Trace of each attribute's block, summed in double precision.
 
-        quats: unit quaternions; P projects them out, and the traces are of P B P.  scale: D, of D P B P D instead.
+        quats: unit quaternions, which P projects out: of P B P instead of B.  scale: the diagonal of D, of D P B P D instead.
         """
         diagonals = self.diagonals if quats is None else self.diagonals_across(quats)
         if scale is not None:
@@ -72,7 +75,7 @@ class PerGaussianBlocks(Brief):
         return {**{name: diagonal[:, columns] for name, columns in GEOMETRY_COLUMNS.items()}, "sh": self.sh.double()}
 
     def diagonals_across(self, quats: Float[Tensor, "n 4"]) -> dict[str, Float64[Tensor, "n ..."]]:
-        """The diagonal of P B P, where P projects out the unit quats."""
+        """The diagonal of P B P, where P projects out the unit quaternions quats."""
         q, columns, diagonals = quats.double(), GEOMETRY_COLUMNS["quats"], self.diagonals
         along = (self.geometry[:, columns, columns].double() @ q[:, :, None])[:, :, 0]
         turns = diagonals["quats"] - 2 * q * along + q.square() * (q * along).sum(dim=1, keepdim=True)

@@ -1,6 +1,6 @@
 """The Hessian of a scene's loss, or its Gauss-Newton part, as an operator of `landscape`: P H P.
 
-H is the mean of the views' Hessians.  P leaves out the directions in which L is exactly flat (`active_spaces.py`); Gaussians
+H is the mean of the views' Hessians.  P projects out the directions in which L is exactly flat (`active_spaces.py`); Gaussians
 that no view sees have already been left out by `SceneObjective`.
 """
 
@@ -17,17 +17,17 @@ from splat.curvature.linearize import VECTORS
 from splat.curvature.null.active_spaces import Projector, projector_of
 from splat.curvature.objective import SceneObjective
 
-# bytes of workspace; beyond it a GPU takes longer for a view's product than its kernels take to launch
+# bytes of workspace up to which products are recorded: above, kernels run for longer than it takes to launch them
 MOST_RECORDED = 1 << 28
 
 
 class ViewSum:
     """The sum of the Hessians, or Gauss-Newton parts, of this process's views: an operator of `landscape` on their device.
 
-    count: of the first so many views alone; of all by default.  coupled: False for the pixel-diagonal of the losses' l'' in
-    place of l'', without the coupling of pixels by SSIM.
-    spared: products of a view with a vector that were left out so far, because the vector moves no Gaussian that the view draws
-    (on a CPU).
+    count: number of views, from the first; all by default.  coupled: False for the pixel-diagonal of the losses' l'' in place
+    of l'', without the coupling of pixels by SSIM.
+    spared: number of products of a view with a vector that were skipped so far, because the vector moves no Gaussian that the
+    view draws (on a CPU).
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class ViewSum:
         return torch.cat(totals, dim=1) if len(totals) > 1 else totals[0]
 
     def forms(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:
-        """v . H_m v of each of this process's views and each column."""
+        """v . H_m v for each of this process's views m and each column v."""
         products = (view.ggn(V) if self.gauss_newton else view.hvp(V) for view in self.objective.linearized)
         return torch.stack([(V.double() * HV).sum(dim=0).cpu() for HV in products])
 
@@ -62,10 +62,9 @@ class SceneHessian:
     A `landscape` operator: `dim` = p, `blocks` (the attributes), `dtype`, and `apply(V)`, which gives its result on V's device.
     Where processes share the views, all of them have to apply it to the same vectors (else ValueError).
 
-    Of the Hessian, P leaves out the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and
-    the SH directions that no view sees; of Gauss-Newton, all directions that no view sees.  keep_null: P = 1 instead.
-    count: the part of H that the first so many views of each process contribute; by default all of it.
-    coupled: see `ViewSum`.
+    For the Hessian, P removes the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and
+    the SH directions that no view sees; for Gauss-Newton, all directions that no view sees.  keep_null: P = 1 instead.
+    count: only the part of H due to so many views of each process, from the first.  coupled: see `ViewSum`.
 
     views: H without P, summed over this process's views.  projector: P.
 
@@ -96,7 +95,7 @@ class SceneHessian:
 
     @property
     def rank(self) -> int:
-        """The dimension of what P keeps."""
+        """The dimension of the range of P."""
         return self.dim if self.keep_null else self.projector.rank
 
     def project(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
@@ -111,7 +110,7 @@ class SceneHessian:
         return self.project(self.objective.mean_over_views(total)).to(V.device)
 
     def _argument(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-        """Vectors that H maps to the same as P V, at less cost."""
+        """Vectors with the same H V as P V, at less cost than P."""
         V = V.to(self.objective.active.flat.device)
         return V if self.keep_null else self.projector.without_lengths(V)
 
@@ -120,7 +119,7 @@ class SceneHessian:
         return self.objective.of_all_views(self.views.forms(self._argument(V)))
 
     def recordable(self, vectors: int) -> bool:
-        """Whether products with so many vectors are worth a CUDA graph: of views on a GPU that are all kept, and small."""
+        """Whether products with so many vectors are worth a CUDA graph: views are on a GPU, all kept, and small."""
         if self.objective.active.flat.device.type != "cuda":
             return False
         views = self.objective.linearized

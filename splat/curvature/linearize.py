@@ -1,7 +1,7 @@
 """The loss of one view, linearised: its value and gradient, and exact products of its Hessian with vectors.
 
 The loss is l(R(P(theta))): the projection P gives splats, the compositing R an image I, and l compares it with the photograph.
-With g = dl/dI and a = R'^T g,
+A prime is a derivative.  With g = l' (the gradient in I) and a = R'^T g,
 
     gradient  P'^T R'^T g
     J u       R' P' u
@@ -9,10 +9,11 @@ With g = dl/dI and a = R'^T g,
     H u       P'^T [ R'^T l'' R' P' u + (g . R'')(P' u) ] + (a . P'') u
 
 P' and P'' of every Gaussian, tile lists, final transmittances, g and a are computed once.  Each product is then two passes over
-the pixels for K vectors together: the columns of U (p, K), laid out like `Gaussians.flat`.  The order of the splats, the
-alpha_min cut, the stop and the clamps are piecewise constant and count as constants.
+the pixels for K vectors together: the columns of U (p, K), laid out like `Gaussians.flat`.  What is piecewise constant counts
+as constant: the order of the splats, the alpha_min cut, where a pixel stops, and the clamps.
 
-Tangents and adjoints of splats are in the coordinates of `projection/whitening.py`.  On a GPU no product waits for the device.
+Tangents and adjoints of splats are in the coordinates of `projection/whitening.py`.  On a GPU, products do not synchronise with
+the device.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -40,13 +41,14 @@ from splat.render.forward import rasterize_view, touches
 
 LOSS_PLANES = 19  # planes that a linearised loss keeps: target, its moments, gradient, a blurred one, a product
 DOUBLE_BLOCK = 8 * 9 * 9  # bytes of a 9 x 9 block in double precision
-VECTORS = 8  # of a product at a time: more would not fit into the second-level cache
+VECTORS = 8  # most vectors in a product at a time: more would not fit into the second-level cache
 
 
 class LinearizedView:
     """A view's loss, linearised at its Gaussians: `.value`, `.image`, `.gradient`, `.jvp(U)`, `.vjp(G)`, `.hvp(U)`, `.ggn(U)`.
 
-    loss: of the view's images, from `losses.autograd.loss_against`.  regularizers: of these Gaussians, a part of the loss.
+    loss: compares images with the view's, from `losses.autograd.loss_against`.  regularizers: added to the loss; by default
+    none.
     """
 
     def __init__(
@@ -83,7 +85,7 @@ class LinearizedView:
 
     @staticmethod
     def size_of(raster: Raster, gaussians: Gaussians, settings: RenderSettings) -> tuple[int, int, int]:
-        """Estimated bytes of a view with this raster: `bytes`, `workspace(1)`, and the workspace of `block_diagonal`."""
+        """Estimates, for a view with this raster, of `bytes`, `workspace(1)` and the bytes that `block_diagonal` takes."""
         size, drawn = gaussians.flat.element_size(), len(raster.touched)
         plane = raster.planes[0].nbytes
         rows = row_shapes(antialiased=settings.antialias != "none" or gaussians.filter_widths is not None)
@@ -113,24 +115,24 @@ class LinearizedView:
 
     @property
     def jacobian(self) -> ProjectionJacobian:
-        """Derivatives of the projection of the Gaussians that have weight in a pixel, found by a pass over the pixels."""
+        """Derivatives of the projection of the Gaussians with weight in some pixel; takes a pass over the pixels."""
         jacobian = self._projection.jacobian
         visible = touches(self._raster)[jacobian.index]
         return ProjectionJacobian(*(part[visible] for part in jacobian))
 
     @property
     def bytes(self) -> int:
-        """Memory kept for the products; the adjoint's cotangent is the loss's gradient and counted there."""
+        """Memory kept for the products; the adjoint's cotangent is the loss's gradient, and is counted with the loss."""
         return self._raster.bytes + self._projection.bytes + self._loss.bytes + self._adjoint.bytes
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that `hvp` of so many vectors takes beside argument, result and the loss's few rows for each thread."""
+        """Bytes that `hvp` of so many vectors takes, without argument, result and a few rows of pixels for each thread."""
         return self._raster.workspace(vectors) + self._loss.workspace(vectors)
 
     def affects(self, U: Float[Tensor, "p k"]) -> bool:
         """Whether products can be other than 0: some vector changes a Gaussian that the view draws.
 
-        Always True on a GPU, where testing it would wait for the device.
+        Always True on a GPU, where the test would synchronise with the device.
         """
         return self._projection.affects(U) or self._regularizers.affects(U)
 
@@ -145,7 +147,7 @@ class LinearizedView:
     def hvp(
         self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, coupled: bool = True
     ) -> Float[Tensor, "p k"]:
-        """H U, added to total where it is given.  coupled: False for the pixel-diagonal of l'' in place of l''."""
+        """H U; added to total in place, where that is given.  coupled: False for the pixel-diagonal of l'' in place of l''."""
         return self._regularizers.add_product(self._projection.vjp(self._adjoint_tangent(U, coupled), U, total), U)
 
     def ggn(
@@ -189,7 +191,7 @@ class LinearizedView:
         return found
 
     def loss_curvatures(self, U: Float[Tensor, "p k"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-        """(J u)^T l'' (J u) of every column, and the same with the pixel-diagonal of l''; takes no backward pass."""
+        """(J u)^T l'' (J u) of every column u, and the same with the pixel-diagonal of l''; takes no backward pass."""
         return self._loss.curvatures(self._tangent(U).planes)
 
     def _tangent(self, U: Float[Tensor, "p k"]) -> Tangent:
@@ -201,7 +203,7 @@ class LinearizedView:
         return tangent.backward_tangent(self._adjoint, self._loss_product(tangent, coupled))
 
     def _loss_product(self, tangent: Tangent, coupled: bool) -> Float[Tensor, "k 4 H W"]:
-        """l'' times the tangents of the image, in their place."""
+        """l'' times the tangents of the image, which are overwritten."""
         planes = tangent.planes
         if coupled:
             return self._loss.hvp(planes, out=planes)
@@ -215,11 +217,11 @@ class LinearizedView:
 
 
 class KeptViews:
-    """Iterates over linearized views: the first `kept` stay in memory, the others are linearized anew every time.
+    """An iterable of linearized views: the first `kept` stay in memory, the others are linearized anew at every iteration.
 
-    linearize: makes the view of an index; count: of views; memory: bytes for views and the workspace of a product with VECTORS
-    vectors, which affects `kept` alone and no result.  `first`, the first view, is made at once, always kept, and stands for
-    the size of all.
+    linearize: makes the view of an index.  count: number of views.  memory: bytes for kept views and the workspace of a product
+    with VECTORS vectors; it decides `kept`, and no result.  `first`, the first view, is made at once and always kept; its size
+    is taken for that of every view.
     """
 
     def __init__(self, linearize: Callable[[int], LinearizedView], count: int, memory: int):

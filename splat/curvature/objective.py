@@ -5,10 +5,10 @@
 theta: the parameters of the active Gaussians, laid out like `Gaussians.flat`; I_m: the render of view m; l: the loss against
 its picture; R: regularisers of opacities and scales, where there are any (`losses/regularizers.py`).  Parameters that no l can
 depend on are removed and counted: Gaussians that touch no pixel of any view, and SH bands not in use; their share of R is a
-constant.  Quaternions are brought to unit length: the image does not change, and the trace of their block of the Hessian, which
-scales with 1/|q|^2, gets a meaning.
+constant.  Quaternions are normalised: this changes no image, and makes the trace of their block of the Hessian, which scales
+with 1/|q|^2, well defined.
 
-Processes can share the views (`landscape.Ranks`): every rank holds some views and all Gaussians.
+Processes can share the views (`landscape.Ranks`): every rank has some of the views, and all Gaussians.
 
     ranks = Ranks.joined()
     objective = SceneObjective(gaussians, scene.load(ranks.share(names)), ranks=ranks)
@@ -39,10 +39,10 @@ from splat.model.settings import RenderSettings
 from splat.render.forward import background_of, rasterize_view, touches
 from splat.scenes.view import View
 
-OWN_BLOCK = 11 * 11  # numbers of a Gaussian's block without SH
-KEPT_BLOCKS = 4  # approximate and exact ones, each of the Hessian and of a Gauss-Newton part
-COPIES = 5  # of a vector, in a product: itself, without its null part, the sum, a view's, the result
-FEWEST, AT_ONCE = 8, 4  # vectors of a small basis; of a product
+GEOMETRY_BLOCK = 11 * 11  # numbers of a Gaussian's block without SH
+KEPT_BLOCKS = 4  # sets of blocks: approximate and exact ones, each of the Hessian and of a Gauss-Newton part
+COPIES = 5  # of a vector in a product: the argument, its projection, the sum over views, a view's product, the result
+BASIS, BATCH = 8, 4  # vectors of the smallest basis of an eigensolver, and in its products
 
 
 class NothingInSight(InputError):
@@ -51,11 +51,11 @@ class NothingInSight(InputError):
 
 @dataclass(frozen=True)
 class ActiveCounts:
-    """Counts of what is left of a set of Gaussians in the objective, and of what was removed because L is exactly flat there.
+    """Numbers of Gaussians and parameters, given and active; L is exactly flat in the others.
 
     active_gaussians: those that touch a pixel of some view.  parameters: stored numbers of all Gaussians.  active_parameters:
-    those of the active ones in the SH bands in use, less one for each quaternion, whose length does not count.
-    radial_quaternions: how many such lengths were removed.  views: of all processes.
+    those of the active ones in the SH bands in use, less one for the length of each quaternion.  radial_quaternions: number of
+    such lengths.  views: of all processes.
     """
 
     gaussians: int
@@ -70,8 +70,10 @@ class ActiveCounts:
 
 @dataclass(frozen=True)
 class Needs:
-    """Estimated bytes of a vector over the active parameters, a linearised view, a product for each of its vectors, the kept
-    diagonal blocks of Gaussians, and the pass that makes them.
+    """Estimated bytes.
+
+    vector: of a vector over the active parameters.  view: of the largest linearised view.  product: of a product, for each of
+    its vectors.  blocks: of the diagonal blocks of Gaussians that are kept.  making_blocks: of the pass that computes them.
     """
 
     vector: int
@@ -82,22 +84,22 @@ class Needs:
 
     @property
     def beside(self) -> int:
-        """Memory needed beside linearised views: blocks, a small basis, and the larger of a product and the blocks' pass."""
-        return self.blocks + FEWEST * self.vector + max(AT_ONCE * self.product, self.making_blocks)
+        """Bytes needed in addition to linearised views: blocks, a small basis, and a product or the blocks' pass."""
+        return self.blocks + BASIS * self.vector + max(BATCH * self.product, self.making_blocks)
 
 
 class SceneObjective:
     """The mean loss L over views as a function of the active Gaussians' stored parameters.
 
-    gaussians: n, none of them changed.  loss_settings: l.  background: RGB in [0, 1], black by default.  sh_degree: of the
-    bands in use, those of the Gaussians by default.
-    memory: bytes for linearized views and the workspace of their products (`KeptViews`); by default half of what is free, or an
-    even part of it where several ranks share a CPU.  It decides how long products take, not their values.
-    keep_unseen: all Gaussians are active, for steps so long that they may bring into sight what no view sees at first.
+    gaussians: not modified.  loss_settings: l and R.  background: RGB in [0, 1], black by default.  sh_degree: of the bands in
+    use, by default that of the Gaussians.
+    memory: bytes for linearized views and the workspace of their products (`KeptViews`); by default half of what is free,
+    divided among the ranks that share a CPU.  It decides how long products take, not their values.
+    keep_unseen: all Gaussians are active, for steps so long that Gaussians out of sight may come into sight.
     ranks: processes that share the views; `views` are those of this one.
 
     active: the Gaussians that touch a pixel of some view, with unit quaternions; L is studied at `active.flat` (p,).  mask:
-    which of the given Gaussians they are.  counts: how much was removed.
+    which of the given Gaussians are active.  counts: how many Gaussians and parameters are.
 
     Raises NothingInSight where no Gaussian is seen, InputError where there is no view or no Gaussian, a parameter or the
     background is not finite, or ranks have different Gaussians or settings.
@@ -133,7 +135,7 @@ class SceneObjective:
             ranks.require_same_vectors(gaussians.filter_widths[:, None])
         self.views, self.loss_settings, self.ranks = tuple(views), loss_settings, ranks
         self._views_of_ranks = [int(count) for count in ranks.gather(torch.tensor(len(views)))]
-        # products are repeatable, however the training's steps were made
+        # products give the same bits each time, even where the training's steps do not
         self.settings = replace(settings, accumulation="deterministic")
         self.background = background_of(gaussians, background)
         self._losses = [loss_against(view.image, loss_settings, flat) for view in views]
@@ -144,10 +146,7 @@ class SceneObjective:
         if keep_unseen:
             self.mask = torch.ones_like(self.mask)
         self.active = used.select(self.mask)
-        regularized = loss_settings.opacity_reg or loss_settings.scale_reg
-        self._unseen = (
-            Regularizers(used.select(~self.mask), loss_settings, len(gaussians)).value if regularized else 0.0
-        )
+        self._unseen = Regularizers(used.select(~self.mask), loss_settings, len(gaussians)).value
         quats = self.active.quats
         quats /= quats.norm(dim=1, keepdim=True)
         self.counts = ActiveCounts(
@@ -177,11 +176,12 @@ class SceneObjective:
 
     @property
     def needs(self) -> "Needs":
-        """About what the largest view and its products take."""
-        view, workspace, blocks = self._sizes
+        """Estimated memory of the largest view, its products, and the blocks of the Gaussians."""
+        view, workspace, sums = self._sizes
         n, flat = len(self.active), self.active.flat
-        own = n * flat.element_size() * (OWN_BLOCK + 3 * (self.active.sh_degree + 1) ** 2)
-        return Needs(flat.nbytes, view, workspace + COPIES * flat.nbytes, KEPT_BLOCKS * own, max(blocks + own, 3 * own))
+        blocks = n * flat.element_size() * (GEOMETRY_BLOCK + 3 * (self.active.sh_degree + 1) ** 2)
+        product, making_blocks = workspace + COPIES * flat.nbytes, max(sums + blocks, 3 * blocks)
+        return Needs(flat.nbytes, view, product, KEPT_BLOCKS * blocks, making_blocks)
 
     @property
     def couples_pixels(self) -> bool:
@@ -190,7 +190,7 @@ class SceneObjective:
 
     @property
     def view_numbers(self) -> range:
-        """Places of this rank's views among all views."""
+        """Indices of this rank's views among all views."""
         first = sum(self._views_of_ranks[: self.ranks.rank])
         return range(first, first + len(self.views))
 
@@ -199,60 +199,62 @@ class SceneObjective:
         """The rows of each attribute."""
         return self.active.blocks
 
+    @property
+    def block_dims(self) -> dict[str, int]:
+        """The dimension of each attribute's block, without the lengths of the quaternions."""
+        dims = {name: rows.stop - rows.start for name, rows in self.blocks.items()}
+        return {**dims, "quats": dims["quats"] - len(self.active)}
+
     def evaluate(self, flat: Float[Tensor, " p"]) -> tuple[float, Hashable]:
         """(L, smooth piece) at other parameters of the active Gaussians.
 
-        Splats are rendered and sorted anew.  The smooth piece stands for the splats that each tile draws and their order: L may
-        be discontinuous between two points whose pieces differ.  Changes nothing, and may run in several threads at once.
+        Splats are sorted anew.  The smooth piece identifies the splats that each tile draws and their order: L may be
+        discontinuous between two points whose pieces differ.  Changes no state, and may run in several threads at once.
         """
         gaussians = self.active.with_flat(flat.to(self.active.flat.device))
         gaussians.require_finite()
         losses, pieces = zip(*(self.evaluate_view(index, gaussians) for index in range(len(self.views))), strict=True)
         mean = self.mean_over_views(torch.tensor(sum(losses), dtype=torch.float64))
-        return float(mean), self.gather_pieces(hash(pieces))
+        return float(mean), tuple(int(piece) for piece in self.ranks.gather(torch.tensor(hash(pieces))))
 
     def evaluate_view(self, index: int, gaussians: Gaussians) -> tuple[float, Hashable]:
-        """(l, smooth piece) of one view of this rank, at finite Gaussians in place of the active ones."""
+        """(l + R, smooth piece) of one view of this rank, at finite Gaussians in place of the active ones."""
         raster = rasterize_view(gaussians, self.views[index].camera, self.background, self.settings, finite=True)
         return self._losses[index].value(raster.planes) + self.regularizers(gaussians).value, raster.draw_order
 
     def regularizers(self, gaussians: Gaussians) -> Regularizers:
-        """R at Gaussians in place of the active ones, of whose value those out of sight have their share."""
+        """R at these Gaussians in place of the active ones; its value includes the share of the inactive ones."""
         found = Regularizers(gaussians, self.loss_settings, self.counts.gaussians)
         found.value += self._unseen
         return found
 
     @property
     def loss_of_active(self) -> LossSettings:
-        """The loss as that of a scene of the active Gaussians alone: with their share in the means of R."""
+        """The loss for a scene of the active Gaussians alone: weights of R are scaled, since its means are over all."""
         share, loss = self.counts.active_gaussians / self.counts.gaussians, self.loss_settings
         return replace(loss, opacity_reg=share * loss.opacity_reg, scale_reg=share * loss.scale_reg)
 
     def loss(self, flat: Float[Tensor, " p"]) -> float:
-        """L alone, as of `evaluate`."""
+        """L at other parameters of the active Gaussians; see `evaluate`."""
         return self.evaluate(flat)[0]
 
     def mean_over_views(self, total: Tensor) -> Tensor:
-        """The mean over all views, given the sum over this rank's views."""
+        """The mean over all views, from the sum over this rank's views."""
         return self.ranks.sum(total) / self.counts.views
 
     def of_all_views(self, rows: Shaped[Tensor, "m ..."]) -> Shaped[Tensor, "_ ..."]:
-        """A row for every view of all processes, given those of this rank's views."""
+        """The rows of all views, one a view, from those of this rank's views."""
         whole = rows.new_zeros(self.counts.views, *rows.shape[1:])
         whole[self.view_numbers.start : self.view_numbers.stop] = rows
         return self.ranks.sum(whole)
 
     def gather_rows(self, rows: Float[Tensor, "n m d"]) -> Float[Tensor, "n _ d"]:
-        """The rows of all views, given those of this rank's views: as many for each view."""
+        """The rows of all views, from those of this rank's views; every view has the same number of them."""
         each = rows.shape[1] // len(self.views)
         counts = [count * each for count in self._views_of_ranks]
         padded = torch.nn.functional.pad(rows, (0, 0, 0, max(counts) - rows.shape[1]))
         parts = self.ranks.gather(padded)
         return torch.cat([part[:, :count] for part, count in zip(parts, counts, strict=True)], dim=1)
-
-    def gather_pieces(self, piece: int) -> Hashable:
-        """The smooth piece of L over all views, given that over this rank's views."""
-        return tuple(int(each) for each in self.ranks.gather(torch.tensor(piece)))
 
     @cached_property
     def linearized(self) -> KeptViews:
@@ -260,14 +262,14 @@ class SceneObjective:
         return KeptViews(self.linearizer(self.active), len(self.views), self._memory)
 
     def release(self) -> None:
-        """Free the linearized views, also for other processes; they are made anew on their next use."""
+        """Free the linearized views, and return their memory to the system; the next use makes them anew."""
         vars(self).pop("linearized", None)
         give_back_freed()
 
     def linearizer(self, gaussians: Gaussians) -> Callable[[int], LinearizedView]:
-        """Function that linearizes the view of an index, at the active Gaussians or, for comparison, at others.
+        """A function that linearizes the view of an index at these Gaussians.
 
-        It does not refer to this objective, which would otherwise be freed only when Python looks for circles.
+        It holds no reference to this objective: a reference cycle would keep the objective until the garbage collector runs.
         """
         cameras, losses = [view.camera for view in self.views], self._losses
         background, settings, regularizers = self.background, self.settings, self.regularizers(gaussians)
@@ -294,7 +296,7 @@ class SceneObjective:
         """The block of every Gaussian in the Hessian of L, or in its Gauss-Newton part: exact, on the CPU.
 
         approximate: with the diagonal of the loss's l'' in place of l'', without the coupling of pixels by SSIM.
-        traced: with the traces of every view.
+        traced: with the traces of every view, `PerGaussianBlocks.views`.
         """
         return self.block_diagonals(approximate=approximate, parts=(gauss_newton,), traced=traced)[0]
 
@@ -306,7 +308,7 @@ class SceneObjective:
         traced: bool = True,
         progress: Progress | None = None,
     ) -> list[PerGaussianBlocks]:
-        """`block_diagonal` of several parts at once; parts: which are Gauss-Newton."""
+        """`block_diagonal` for each of parts (True: Gauss-Newton), which share passes over the pixels."""
         totals: list[PerGaussianBlocks] = []
         traces: list[list[dict[str, float]]] = []
         for done, view in enumerate(self.linearized, start=1):
@@ -320,7 +322,7 @@ class SceneObjective:
         return [self._mean_of_blocks(total, [each[i] for each in traces]) for i, total in enumerate(totals)]
 
     def _mean_of_blocks(self, total: PerGaussianBlocks, traces: Sequence[Mapping[str, float]]) -> PerGaussianBlocks:
-        """The mean over all views, given the sum over this process's and the traces of each."""
+        """The mean over all views, from the sum over this rank's views and the traces of each."""
         rows = self.of_all_views(torch.tensor([list(each.values()) for each in traces], dtype=torch.float64))
         views = [dict(zip(traces[0], row, strict=True)) for row in rows.tolist()]
         return PerGaussianBlocks(self.mean_over_views(total.geometry), self.mean_over_views(total.sh), views)

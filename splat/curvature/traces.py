@@ -5,10 +5,10 @@ With E_b the columns of the identity in block b, J the Jacobian of the images, D
     tr(H_b) = T_b + E[x - y]      T_b: trace with D in place of l'' (`SceneObjective.approximate_blocks`)
     x = (J E_b z)^T l'' (J E_b z),  y = (J E_b z)^T D (J E_b z)      z: random signs;  E[y] = C_b is known exactly
 
-y is a control variate: each sample is x - c (y - C_b), where c is fitted to the other samples so that the mean stays unbiased.
-x and y are sums over views, each with random signs of its own, which lowers the variance up to M times for M views.  A sample
-costs one product J u for each block whose error is not small enough yet, and no backward pass.  Where the loss is a sum over
-pixels, l'' = D and the traces are exact.
+y is a control variate: each sample is T_b - C_b + x - c (y - C_b), where c is fitted to the other samples so that the mean
+stays unbiased.  x and y are means over M views with independent random signs, which lowers the variance up to M times.  A
+sample costs one product J u for each block whose error is not small enough yet, and no backward pass.  Where the loss is a sum
+over pixels, l'' = D and the traces are exact.
 
 `sampled_traces` does the same for other parts of the parameters, such as positions along the rays
 (`analysis/measures/depth.py`).
@@ -34,8 +34,8 @@ from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
 
 ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
-LEAST_SAMPLES = 4  # a mean, a slope, and a spread of two degrees of freedom
-COLUMNS = 5  # vectors in a pass over the pixels: one for each block
+LEAST_SAMPLES = 4  # for a mean, a slope, and a variance with two degrees of freedom
+COLUMNS = 5  # most vectors in a pass over the pixels: one for each attribute
 
 Dimension = Literal["active", "attribute"]
 Draw = Callable[[int, Sequence[torch.Generator], Sequence[str]], Float[Tensor, "p b s"]]
@@ -56,8 +56,8 @@ def exact_traces(
 ) -> dict[str, TraceEstimate]:
     """Traces of the named attributes' blocks of H, without the quaternions' radial directions, by name.
 
-    By default to 1%, from 8 to 64 samples; exact where the loss does not couple pixels (ssim_weight = 0).
-    gauss_newton: of the Gauss-Newton part, whose T_b is C_b.  scale: D > 0, one number a parameter; of D H D instead of H.
+    By default to 1%, with 8 to 64 samples; exact where the loss does not couple pixels (ssim_weight = 0).
+    gauss_newton: of the Gauss-Newton part, where T_b = C_b.  scale: (p,) positive; of S H S, S = diag(scale), instead of H.
     settings: rtol, atol, confidence, min_probes and max_probes (of samples), and max_seconds; the rest is ignored.
     samples: an exact number, at least LEAST_SAMPLES, for rough values; overrides the settings.
 
@@ -75,13 +75,11 @@ def exact_traces(
     if gauss_newton:
         whole = objective.pixelwise_blocks
     known = {name: value for name, value in whole.traces(quats, units).items() if name in names}
-    sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
-    sizes["quats"] -= len(objective.active)
     pixelwise = {} if coupled is None else coupled.traces(quats, units)
     first, most = (samples, samples) if samples else (settings.min_probes, settings.max_probes)
     traces = [
         SampledTrace(
-            name, sizes[name], known[name], pixelwise.get(name), settings, first, most,
+            name, objective.block_dims[name], known[name], pixelwise.get(name), settings, first, most,
             None if scale is not None else [view[name] for view in whole.views],
         )
         for name in known
@@ -90,32 +88,24 @@ def exact_traces(
 
 
 def block_traces(objective: SceneObjective) -> dict[str, TraceEstimate]:
-    """The same traces without a sample: sums over the Gaussians' exact own blocks, which only a CPU has."""
+    """The same traces without sampling: sums over the exact diagonal blocks of the Gaussians, on the CPU only."""
     blocks = objective.exact_blocks[0]
-    found = blocks.traces(objective.active.quats)
-    sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
-    sizes["quats"] -= len(objective.active)
-    return {
-        name: TraceEstimate.exact(
-            name, sizes[name], value, ONE_PERCENT.confidence, terms=_terms([view[name] for view in blocks.views])
-        )
-        for name, value in found.items()
-    }
-
-
-def _terms(values: Sequence[float]) -> Float64[Tensor, " m"]:
-    """`TraceEstimate.terms`: of every view."""
-    return torch.tensor(values, dtype=torch.float64)
+    found = {}
+    for name, value in blocks.traces(objective.active.quats).items():
+        terms = torch.tensor([view[name] for view in blocks.views], dtype=torch.float64)
+        dim = objective.block_dims[name]
+        found[name] = TraceEstimate.exact(name, dim, value, ONE_PERCENT.confidence, terms=terms)
+    return found
 
 
 def curvature_scale(trace: float, parameters: int, gaussians: int, dimension: Dimension) -> float:
-    """tau of a block, StableGS's curvature scale of an attribute: sqrt(max(trace, 0) / dim), 0 of an empty block.
+    """Curvature scale tau of an attribute's block, as in StableGS: sqrt(max(trace, 0) / dim), 0 for an empty block.
 
-    parameters: of the block, N d of N active Gaussians, d = 3 for means, log-scales and quaternions (on the unit sphere), 1 for
-    opacities and 3 (l + 1)^2 for SH of degree l.  The paper's H spans all Gaussians, but its d is that of one:
+    parameters: of the block, N d for N active Gaussians; d = 3 for means, log-scales and quaternions (on the unit sphere), 1
+    for opacities and 3 (l + 1)^2 for SH of degree l.  In the paper H spans all Gaussians, but d is that of a single one:
 
-    dimension "active"      dim = N d: the root of the mean curvature of a parameter; what a probe records
-    dimension "attribute"   dim = d: larger by sqrt(N); the paper's letter, and the default of its probes (`ProbeSettings`)
+    dimension "active"      dim = N d: the root of the mean curvature of a parameter; what `landscape probe` records
+    dimension "attribute"   dim = d: larger by sqrt(N); as the paper says, and the default of its probes (`ProbeSettings`)
 
     >>> curvature_scale(12.0, 12, 4, "active"), curvature_scale(12.0, 12, 4, "attribute")
     (1.0, 2.0)
@@ -131,27 +121,27 @@ def sampled_traces(
     traces: Sequence["SampledTrace"],
     progress: Progress | None = None,
 ) -> dict[str, TraceEstimate]:
-    """Sample traces side by side until each is accurate enough or out of samples or time."""
+    """Estimates of traces, sampled together until each is accurate enough or out of samples or time."""
     start = monotonic()
-    while still := [trace for trace in traces if trace.open]:
-        count, next_look = still[0].count, min(trace.looks.next for trace in still)
+    while unfinished := [trace for trace in traces if trace.open]:
+        count, next_check = unfinished[0].count, min(trace.rule.next for trace in unfinished)
         # few traces leave room for several samples in the pass over the pixels
-        together = min(max(COLUMNS // len(still), 1), next_look - count)
-        sampled = coupling_samples(objective, generator, draw, [trace.name for trace in still], together)
+        batch = min(max(COLUMNS // len(unfinished), 1), next_check - count)
+        sampled = coupling_samples(objective, generator, draw, [trace.name for trace in unfinished], batch)
         seconds = monotonic() - start
-        for trace, x, y in zip(still, *(each.unbind(dim=1) for each in sampled), strict=True):
+        for trace, x, y in zip(unfinished, *(part.unbind(dim=1) for part in sampled), strict=True):
             trace.add(x, y, late=seconds > trace.settings.max_seconds)
         if progress:
-            state = f"traces: {count + together} samples of the coupling between pixels"
-            progress(count + together, still[0].most, state)
+            state = f"traces: {count + batch} samples of the coupling between pixels"
+            progress(count + batch, unfinished[0].most, state)
     return {trace.name: trace.estimate() for trace in traces}
 
 
 class SampledTrace:
-    """The samples of one trace, at least `first` and at most `most`, and whether it needs more (`open`).
+    """Samples of one trace, at least `first` and at most `most`, and whether it needs more (`open`).
 
-    known: T_b of the module's docstring.  pixelwise: C_b; None where the loss does not couple pixels, so that T_b is the trace.
-    views: T_b of the single views, where these are wanted too.
+    dim: dimension of the block.  known: T_b of the module's docstring.  pixelwise: C_b; None where the loss does not couple
+    pixels, so that T_b is the trace.  views: T_b of each view, for `TraceEstimate.terms`.
     """
 
     def __init__(
@@ -167,35 +157,35 @@ class SampledTrace:
     ):
         self.name, self.dim, self.settings, self.first, self.most = name, dim, settings, first, most
         self.known, self.pixelwise, self.views = known, pixelwise, views
-        self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
-        self.apart: list[Float64[Tensor, "m s"]] = []
-        # a run ends at `first` samples at the earliest: if the tolerance holds there and held CONFIRMATION samples before
-        look = most if first == most else max(first - CONFIRMATION, LEAST_SAMPLES)
-        self.looks, self.open, self.late = StoppingRule(look, most), pixelwise is not None, False
+        self.x = self.y = torch.zeros(0, dtype=torch.float64)
+        self.differences: list[Float64[Tensor, "m s"]] = []  # x - y of each view
+        # a run can end at `first` samples: where the tolerance holds there and CONFIRMATION samples earlier
+        check = most if first == most else max(first - CONFIRMATION, LEAST_SAMPLES)
+        self.rule, self.open, self.late = StoppingRule(check, most), pixelwise is not None, False
 
     @property
     def count(self) -> int:
-        return len(self.full)
+        return len(self.x)
 
     def add(self, x: Float64[Tensor, "m s"], y: Float64[Tensor, "m s"], late: bool) -> None:
-        """x and y of the single views."""
-        self.full, self.diagonal = torch.cat([self.full, x.mean(dim=0)]), torch.cat([self.diagonal, y.mean(dim=0)])
-        self.apart.append(x - y)
+        """Take in samples of every view; late: the time is up, which ends the run if there are `first` samples."""
+        self.x, self.y = torch.cat([self.x, x.mean(dim=0)]), torch.cat([self.y, y.mean(dim=0)])
+        self.differences.append(x - y)
         self.late = late and self.count >= self.first
         if self.late:
             self.open = False
-        elif self.count == self.looks.next:
-            self.open = not self.looks.end(self.count, self.estimate().reason == "tolerance")
+        elif self.count == self.rule.next:
+            self.open = not self.rule.end(self.count, self.estimate().reason == "tolerance")
 
     def estimate(self) -> TraceEstimate:
-        settings, terms = self.settings, None if self.views is None else _terms(self.views)
+        settings, terms = self.settings, None if self.views is None else torch.tensor(self.views, dtype=torch.float64)
         if self.pixelwise is None:
             return TraceEstimate.exact(self.name, self.dim, self.known, settings.confidence, terms=terms)
         if terms is not None:
-            terms += torch.cat(self.apart, dim=1).mean(dim=1)  # T_b + E[x - y] of every view
-        samples = self.known - self.pixelwise + controlled(self.full, self.diagonal, self.pixelwise)
+            terms += torch.cat(self.differences, dim=1).mean(dim=1)  # T_b + E[x - y] of every view
+        samples = self.known - self.pixelwise + controlled(self.x, self.y, self.pixelwise)
         value = float(samples.mean())
-        error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.pixelwise))
+        error = max(float(samples.std()) / sqrt(self.count), regression_error(self.x, self.y, self.pixelwise))
         # the fitted coefficient takes one more degree of freedom than the mean
         quantile = t_quantile(self.count - 2, settings.confidence)
         half = quantile * error * (WIDENING if settings.adaptive and self.first < self.most else 1.0)
@@ -209,23 +199,23 @@ class SampledTrace:
 
 
 def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> float:
-    """The standard error of the regression line through (control, samples) at control = mean; 0 where control is constant.
+    """Standard error of the regression line of samples on control, at control = mean; 0 where control is constant.
 
-    With few samples it is often larger than the standard error of the controlled samples, which share most of a slope.
+    With few samples it is often larger than the standard error of the controlled samples, whose slopes are correlated.
     """
     count, centred = len(samples), control - control.mean()
     spread = float(centred.square().sum())
     if count < 3 or spread == 0:
         return 0.0
-    rest = samples - samples.mean() - float((samples * centred).sum()) / spread * centred
-    off = float(control.mean()) - mean
-    return sqrt(float(rest.square().sum()) / (count - 2) * (1 / count + off**2 / spread))
+    residuals = samples - samples.mean() - float((samples * centred).sum()) / spread * centred
+    offset = float(control.mean()) - mean
+    return sqrt(float(residuals.square().sum()) / (count - 2) * (1 / count + offset**2 / spread))
 
 
 def coupling_samples(
     objective: SceneObjective, generator: torch.Generator, draw: Draw, names: Sequence[str], count: int
 ) -> tuple[Float64[Tensor, "m b s"], Float64[Tensor, "m b s"]]:
-    """x and y of every view and the named parts for `count` draws, which depend on neither names nor count."""
+    """x and y of every view and named part for `count` draws; neither names nor count change the random numbers of a draw."""
     seeds = torch.randint(2**62, (count,), generator=generator, device=generator.device).tolist()
     found = []
     for index, linearized in enumerate(objective.linearized):
@@ -243,7 +233,7 @@ def _signs(
     generators: Sequence[torch.Generator],
     names: Sequence[str],
 ) -> Float[Tensor, "p b s"]:
-    """`Draw` of random signs in each named block, times scale."""
+    """Random signs in each named block, times scale: a `Draw`."""
     flat = objective.active.flat
     U = flat.new_zeros(flat.numel(), len(names), len(generators))
     for j, generator in enumerate(generators):

@@ -1,11 +1,13 @@
-"""The projection of one view, linearised: first and second derivatives as products with blocks of vectors.
+"""The projection P of one view, linearised: products of its first and second derivatives with K vectors at a time.
 
-Per Gaussian that matters, the Jacobian of the map from its stored parameters to its splat and the curvature `(a . P'')`, a the
-first-order adjoint of its splat.  SH enters the colour linearly: its derivatives are the harmonics at the view direction and
-their slope in the mean, so a Gaussian needs 179 numbers, not a dense 9 x 59 and 59 x 59; 20 more where it is antialiased.
+For each Gaussian at an index (m,), a `ProjectionJacobian` keeps the Jacobian of its splat in its stored parameters, and the
+curvature (a . P''), a the first-order adjoint of its splat.  The colour is linear in SH: its derivatives are the harmonics at
+the view direction and their slope in the mean, so a Gaussian takes 179 numbers in place of 9 x 59 and 59 x 59; 20 more where it
+is antialiased.
 
-Tangents and adjoints of the stored parameters are (n, parameters of a Gaussian..., K) per attribute: views of a (p, K) block
-that is laid out like the flat vector.  Tangents and adjoints of splats are (n, K, 9), in the coordinates of `whitening.py`.
+Tangents d_... and adjoints out_... of the stored parameters are (n, numbers of the attribute..., K): views of a (p, K) array
+laid out like `Gaussians.flat`.  Tangents and adjoints of splats are (n, K, 9), in the coordinates of `whitening.py`.  In loops,
+e counts rows of the Jacobian, i Gaussians, k vectors.
 """
 
 from math import prod
@@ -35,13 +37,13 @@ from splat.projection.formulas import (
 )
 from splat.projection.whitening import cancellation, geometry_coefficients, plain_gradient, put, whitening
 
-LEAST_CANCELLATION = 4.0  # from which on tangents take double precision
-FEW = 64  # Gaussians that are looked at before all are
+LEAST_CANCELLATION = 4.0  # `cancellation` above which tangents take double precision
+FEW = 64  # Gaussians that `affects` tests before it tests all
 
 
 @formula
 def variables(like, mean, log_scales, quat):
-    """The ten numbers of a Gaussian's geometry as variables; like: an array of the tangents' dtype."""
+    """A Gaussian's mean, log-scales and quaternion as dual numbers; like: an array of the tangents' dtype."""
     x = (variable(like, mean[0], 0), variable(like, mean[1], 1), variable(like, mean[2], 2))
     s = (variable(like, log_scales[0], 3), variable(like, log_scales[1], 4), variable(like, log_scales[2], 5))
     q = (variable(like, quat[0], 6), variable(like, quat[1], 7), variable(like, quat[2], 8), variable(like, quat[3], 9))
@@ -50,7 +52,7 @@ def variables(like, mean, log_scales, quat):
 
 @kernel
 def linearize_geometry(lens, W, like, mean, log_scales, quat, bar, jacobian, curvature):
-    """One Gaussian's Jacobian (5, 10) and the packed curvature (55,) of its geometry; like: of the tangents' dtype."""
+    """Fill a Gaussian's jacobian (5, 10) and packed curvature (55,); bar: plain adjoint of its splat; like: of `variables`."""
     x, s, q = variables(like, mean, log_scales, quat)
     tangents = np.empty((5, DIRECTIONS), like.dtype)
     values = geometry(lens, x, s, q)
@@ -63,7 +65,7 @@ def linearize_geometry(lens, W, like, mean, log_scales, quat, bar, jacobian, cur
 
 @formula
 def pack_curvature(adjoint, tangents, curvature):
-    """The lower triangle of the tangents of an adjoint of mean, log-scales and quaternion."""
+    """Fill curvature (55,) with the lower triangle of the tangents of the geometry's ten adjoints, which are dual numbers."""
     m, t, r = adjoint
     rows = (m[0], m[1], m[2], t[0], t[1], t[2], r[0], r[1], r[2], r[3])
     place = 0
@@ -80,7 +82,9 @@ def linearize_antialiased(
 ):
     """`linearize_geometry` of an antialiased Gaussian, in double precision, and the derivatives of its opacity.
 
-    bar[5]: S / opacity.  The opacity's curvature with its logit is S ln' sigmoid(logit) times its slope, S (1 - sigmoid).
+    Its opacity is sigmoid(logit) times a factor of the geometry (`antialias.py`).  bar[5]: S / opacity, S the adjoint of
+    q = ln alpha.  opacity_slope: d ln(factor) in the geometry; opacity_curvature: S (1 - sigmoid(logit)) times it, the mixed
+    second derivative with the logit.
     """
     like = np.empty(0)
     x, s, q = variables(like, mean, log_scales, quat)
@@ -88,20 +92,20 @@ def linearize_antialiased(
     values = antialiased_geometry(lens, x, s, q, width)
     for j in range(6):
         store(tangents.reshape(-1), j * DIRECTIONS, tangent_of(values[j]))
-    factor, own = value_of(values[5]), sigmoid(logit)
-    S = own * factor * bar[5]
+    factor, unfiltered = value_of(values[5]), sigmoid(logit)
+    S = unfiltered * factor * bar[5]
     for k in range(GEOMETRY):
         put(jacobian[:, k], geometry_coefficients(W, tangents[:5, k]))
         opacity_slope[k] = tangents[5, k] / factor if factor > 0 else 0.0
         opacity_curvature[k] = S * sigmoid(-logit) * opacity_slope[k]
-    pack_curvature(antialiased_adjoint(lens, x, s, q, width, with_factor(bar, own)), tangents, curvature)
+    pack_curvature(antialiased_adjoint(lens, x, s, q, width, with_factor(bar, unfiltered)), tangents, curvature)
 
 
 @formula
 def linearize_colour(lens, mean, x, colour_weight, bands, curvature, harmonic, slope):
-    """One Gaussian's harmonics (16,), their derivative in the mean (16, 3), and what the colours add to its curvature.
+    """Fill one Gaussian's harmonics (16,) and their slope in the mean (16, 3); add the colour's part to its curvature.
 
-    colour_weight: (16,) the adjoint of the direction's harmonics, sum_c sh[k, c] colour_bar[c].
+    x: the mean as dual numbers; colour_weight: (16,) the adjoint of the harmonics, sum_c sh[k, c] colour_bar[c].
     """
     tangents = np.empty(DIRECTIONS, slope.dtype)
     along = colour_adjoint(lens, x, colour_weight, bands)
@@ -119,10 +123,10 @@ def linearize_colour(lens, mean, x, colour_weight, bands, curvature, harmonic, s
 
 @kernel
 def linearize_gaussian(lens, W, mean, log_scales, quat, bar, jacobian, curvature):
-    """`linearize_geometry` in the precision that it needs.
+    """`linearize_geometry` with tangents in double precision for slanted needles, in that of the parameters for others.
 
-    The geometry of a slanted needle has tangents in double precision: they cancel by a c / (a c - b^2), in whitening as well as
-    in `geometry_adjoint`.
+    Tangents of a needle lose digits by cancellation, by the factor a c / (a c - b^2) of its conic, in whitening as well as in
+    `geometry_adjoint`.
     """
     if cancellation(W) > LEAST_CANCELLATION:
         linearize_geometry(lens, W, np.empty(0), mean, log_scales, quat, bar, jacobian, curvature)
@@ -131,124 +135,134 @@ def linearize_gaussian(lens, W, mean, log_scales, quat, bar, jacobian, curvature
 
 
 @kernel
-def linearize_all(start, stop, found, lens, means, log_scales, quats, logits, sh, widths, splats, moments):
-    """Fill the rows of a `ProjectionJacobian`; moments (n, 9): the adjoint of the splats; widths: as for `project_splats`."""
+def linearize_all(start, stop, jac, lens, means, log_scales, quats, logits, sh, widths, splats, moments):
+    """Fill rows of a `ProjectionJacobian`.  moments (n, 9): adjoint of the splats; widths: as for `project_splats`."""
     bands = sh.shape[1]
     for e in range(start, stop):
-        i = found.index[e]
+        i = jac.index[e]
         weight = np.zeros(16)
         for c in range(3):
-            found.visible[e, c] = 1.0 if splats[i, 6 + c] > 0 else 0.0
-            found.colour_bar[e, c] = found.visible[e, c] * moments[i, 6 + c]
+            jac.visible[e, c] = 1.0 if splats[i, 6 + c] > 0 else 0.0
+            jac.colour_bar[e, c] = jac.visible[e, c] * moments[i, 6 + c]
             for k in range(bands):
-                weight[k] += sh[i, k, c] * found.colour_bar[e, c]
+                weight[k] += sh[i, k, c] * jac.colour_bar[e, c]
         mean, log_scale, quat, W = point(means, i), point(log_scales, i), quaternion(quats, i), whitening(splats[i])
-        bar, opacity = plain_gradient(W, splats[i, 5], six_of(moments[i])), splats[i, 5]
+        opacity = splats[i, 5]
+        bar = plain_gradient(W, opacity, six_of(moments[i]))
         if widths is None:
-            linearize_gaussian(lens, W, mean, log_scale, quat, bar, found.jacobian[e], found.curvature[e])
+            linearize_gaussian(lens, W, mean, log_scale, quat, bar, jac.jacobian[e], jac.curvature[e])
         else:
             width, logit = np.float64(widths[i]), np.float64(logits[i])
             opacity = sigmoid(logit)
             linearize_antialiased(
-                lens, W, mean, log_scale, quat, logit, width, bar, found.jacobian[e], found.curvature[e],
-                found.opacity_slope[e], found.opacity_curvature[e],
+                lens, W, mean, log_scale, quat, logit, width, bar, jac.jacobian[e], jac.curvature[e],
+                jac.opacity_slope[e], jac.opacity_curvature[e],
             )  # fmt: skip
-        found.logit_slope[e] = 1 - opacity
-        found.logit_curvature[e] = (1 - opacity) * (1 - 2 * opacity) * moments[i, 0]
-        x, _s, _q = variables(found.slope, mean, log_scale, quat)
-        linearize_colour(lens, mean, x, weight, bands, found.curvature[e], found.harmonic[e], found.slope[e])
+        jac.logit_slope[e] = 1 - opacity
+        jac.logit_curvature[e] = (1 - opacity) * (1 - 2 * opacity) * moments[i, 0]
+        x, _s, _q = variables(jac.slope, mean, log_scale, quat)
+        linearize_colour(lens, mean, x, weight, bands, jac.curvature[e], jac.harmonic[e], jac.slope[e])
         for c in range(3):
             for j in range(3):
                 total = 0.0
                 for k in range(bands):
-                    total += sh[i, k, c] * found.slope[e, k, j]
-                found.colour_slope[e, c, j] = total
+                    total += sh[i, k, c] * jac.slope[e, k, j]
+                jac.colour_slope[e, c, j] = total
 
 
 @formula
-def geometry_tangent(u, i, k, d_means, d_log_scales, d_quats):
-    """Fill u (10,), Gaussian i's part of vector k."""
+def gather_tangent(u, i, k, d_means, d_log_scales, d_quats):
+    """Fill u (10,) with the geometry of Gaussian i in vector k."""
     for j in range(3):
         u[j], u[3 + j] = d_means[i, j, k], d_log_scales[i, j, k]
     for j in range(4):
         u[6 + j] = d_quats[i, j, k]
 
 
+@formula
+def unpack_curvature(packed, curvature):
+    """Fill the symmetric curvature (10, 10) from its lower triangle; see `pack_curvature`."""
+    place = 0
+    for j in range(GEOMETRY):
+        for l in range(j + 1):
+            curvature[j, l] = curvature[l, j] = packed[place + l]
+        place += j + 1
+
+
 @kernel
-def push_forward(start, stop, at, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
-    """P' u: out (n, K, 9), which starts at 0."""
+def push_forward(start, stop, jac, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
+    """Write P' u of K vectors to out (n, K, 9); rows of other Gaussians stay as they are."""
     K, bands = out.shape[1], d_sh.shape[1]
     u = np.empty(GEOMETRY, out.dtype)
     for e in range(start, stop):
-        i = at.index[e]
+        i = jac.index[e]
         for k in range(K):
-            geometry_tangent(u, i, k, d_means, d_log_scales, d_quats)
-            out[i, k, 0] = at.logit_slope[e] * d_logits[i, k]
-            for j in range(at.opacity_slope.shape[1]):
-                out[i, k, 0] += at.opacity_slope[e, j] * u[j]
+            gather_tangent(u, i, k, d_means, d_log_scales, d_quats)
+            out[i, k, 0] = jac.logit_slope[e] * d_logits[i, k]
+            for j in range(jac.opacity_slope.shape[1]):
+                out[i, k, 0] += jac.opacity_slope[e, j] * u[j]
             for r in range(5):
                 total = out.dtype.type(0)
                 for j in range(GEOMETRY):
-                    total += at.jacobian[e, r, j] * u[j]
+                    total += jac.jacobian[e, r, j] * u[j]
                 out[i, k, 1 + r] = total
             for c in range(3):
                 total = out.dtype.type(0)
                 for j in range(3):
-                    total += at.colour_slope[e, c, j] * u[j]
+                    total += jac.colour_slope[e, c, j] * u[j]
                 for b in range(bands):
-                    total += at.harmonic[e, b] * d_sh[i, b, c, k]
-                out[i, k, 6 + c] = at.visible[e, c] * total
+                    total += jac.harmonic[e, b] * d_sh[i, b, c, k]
+                out[i, k, 6 + c] = jac.visible[e, c] * total
 
 
 @kernel
 def pull_back(
-    start, stop, at, second_order, cotangents, d_means, d_log_scales, d_quats, d_logits, d_sh,
+    start, stop, jac, second_order, cotangents, d_means, d_log_scales, d_quats, d_logits, d_sh,
     out_means, out_log_scales, out_quats, out_logits, out_sh,
 ):  # fmt: skip
-    """Add P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order, to the outputs."""
+    """Add P'^T y for cotangents y (n, K, 9), plus (a . P'') u for vectors u (d_...) where second_order, to out_...
+
+    Without second_order the d_... are read, but not used.
+    """
     K, bands = cotangents.shape[1], out_sh.shape[1]
     u, h, bar = np.empty(GEOMETRY, out_means.dtype), np.empty(GEOMETRY, out_means.dtype), np.empty(3, out_means.dtype)
-    curvature = np.empty((GEOMETRY, GEOMETRY), out_means.dtype)
+    curvature = np.empty((GEOMETRY, GEOMETRY), out_means.dtype)  # h: the result in a Gaussian's geometry
     for e in range(start, stop):
-        i = at.index[e]
+        i = jac.index[e]
         if second_order:
-            place = 0
-            for j in range(GEOMETRY):
-                for l in range(j + 1):
-                    curvature[j, l] = curvature[l, j] = at.curvature[e, place + l]
-                place += j + 1
+            unpack_curvature(jac.curvature[e], curvature)
         for k in range(K):
             y = cotangents[i, k]
-            geometry_tangent(u, i, k, d_means, d_log_scales, d_quats)
+            gather_tangent(u, i, k, d_means, d_log_scales, d_quats)
             for c in range(3):
-                bar[c] = at.visible[e, c] * y[6 + c]
+                bar[c] = jac.visible[e, c] * y[6 + c]
             h[:] = 0
             for r in range(5):
                 for j in range(GEOMETRY):
-                    h[j] += at.jacobian[e, r, j] * y[1 + r]
+                    h[j] += jac.jacobian[e, r, j] * y[1 + r]
             for c in range(3):
                 for j in range(3):
-                    h[j] += at.colour_slope[e, c, j] * bar[c]
-            logit = at.logit_slope[e] * y[0]
-            for j in range(at.opacity_slope.shape[1]):
-                h[j] += at.opacity_slope[e, j] * y[0]
+                    h[j] += jac.colour_slope[e, c, j] * bar[c]
+            logit = jac.logit_slope[e] * y[0]
+            for j in range(jac.opacity_slope.shape[1]):
+                h[j] += jac.opacity_slope[e, j] * y[0]
                 if second_order:
-                    h[j] += at.opacity_curvature[e, j] * d_logits[i, k]
-                    logit += at.opacity_curvature[e, j] * u[j]
+                    h[j] += jac.opacity_curvature[e, j] * d_logits[i, k]
+                    logit += jac.opacity_curvature[e, j] * u[j]
             if second_order:
                 for j in range(GEOMETRY):
                     for l in range(GEOMETRY):
                         h[l] += curvature[j, l] * u[j]
-                logit += at.logit_curvature[e] * d_logits[i, k]
+                logit += jac.logit_curvature[e] * d_logits[i, k]
             out_logits[i, k] += logit
             for b in range(bands):
-                slope, weight = at.slope[e, b], out_means.dtype.type(0)
+                slope, weight = jac.slope[e, b], out_means.dtype.type(0)
                 along = slope[0] * u[0] + slope[1] * u[1] + slope[2] * u[2]
                 for c in range(3):
-                    total = at.harmonic[e, b] * bar[c]
+                    total = jac.harmonic[e, b] * bar[c]
                     if second_order:
-                        total += at.colour_bar[e, c] * along
-                        weight += at.colour_bar[e, c] * d_sh[i, b, c, k]
+                        total += jac.colour_bar[e, c] * along
+                        weight += jac.colour_bar[e, c] * d_sh[i, b, c, k]
                     out_sh[i, b, c, k] += total
                 for j in range(3):
                     h[j] += slope[j] * weight
@@ -260,24 +274,24 @@ def pull_back(
 
 
 @kernel
-def chain_blocks(start, stop, at, blocks, second_order, geometry_out, sh_out):
-    """Diagonal blocks of splats, B (m, 9, 9), in stored parameters: P'^T B P', plus (a . P'') where second_order.
+def chain_blocks(start, stop, jac, blocks, second_order, geometry_out, sh_out):
+    """Write P'^T B P' for diagonal blocks B (m, 9, 9) of splats, plus (a . P'') where second_order.
 
-    geometry_out: (n, 11, 11) over mean, log-scales, quaternion and opacity logit; sh_out: (n, k, 3), the diagonal of SH's.
+    geometry_out: (n, 11, 11) over mean, log-scales, quaternion and opacity logit.  sh_out: (n, bands, 3), the diagonal for SH.
     """
     bands = sh_out.shape[1]
     J, product = np.zeros((9, GEOMETRY + 1)), np.zeros(9)
     for e in range(start, stop):
-        i = at.index[e]
-        J[0, GEOMETRY] = at.logit_slope[e]
-        J[1:6, :GEOMETRY] = at.jacobian[e]
-        for j in range(at.opacity_slope.shape[1]):
-            J[0, j] = at.opacity_slope[e, j]
+        i = jac.index[e]
+        J[0, GEOMETRY] = jac.logit_slope[e]
+        J[1:6, :GEOMETRY] = jac.jacobian[e]
+        for j in range(jac.opacity_slope.shape[1]):
+            J[0, j] = jac.opacity_slope[e, j]
         for c in range(3):
             for j in range(3):
-                J[6 + c, j] = at.visible[e, c] * at.colour_slope[e, c, j]
+                J[6 + c, j] = jac.visible[e, c] * jac.colour_slope[e, c, j]
             for b in range(bands):
-                sh_out[i, b, c] = at.visible[e, c] * at.harmonic[e, b] * at.harmonic[e, b] * blocks[e, 6 + c, 6 + c]
+                sh_out[i, b, c] = jac.visible[e, c] * jac.harmonic[e, b] * jac.harmonic[e, b] * blocks[e, 6 + c, 6 + c]
         for j in range(GEOMETRY + 1):
             for r in range(9):
                 product[r] = 0
@@ -288,12 +302,12 @@ def chain_blocks(start, stop, at, blocks, second_order, geometry_out, sh_out):
                 for r in range(9):
                     total += J[r, k] * product[r]
                 if second_order and j < GEOMETRY:
-                    total += at.curvature[e, j * (j + 1) // 2 + k]
+                    total += jac.curvature[e, j * (j + 1) // 2 + k]
                 geometry_out[i, j, k] = geometry_out[i, k, j] = total
         if second_order:
-            geometry_out[i, GEOMETRY, GEOMETRY] += at.logit_curvature[e]
-            for j in range(at.opacity_curvature.shape[1]):
-                geometry_out[i, GEOMETRY, j] += at.opacity_curvature[e, j]
+            geometry_out[i, GEOMETRY, GEOMETRY] += jac.logit_curvature[e]
+            for j in range(jac.opacity_curvature.shape[1]):
+                geometry_out[i, GEOMETRY, j] += jac.opacity_curvature[e, j]
                 geometry_out[i, j, GEOMETRY] = geometry_out[i, GEOMETRY, j]
 
 
@@ -312,26 +326,28 @@ class CpuProjection:
         self.n, self.sh_degree, self.parameters = len(gaussians), gaussians.sh_degree, gaussians.flat.numel()
         self._shapes = tuple(attribute_shapes(self.n, self.sh_degree).values())
         rows = row_shapes(antialiased=widths is not None)
-        self._at = ProjectionJacobian(index.numpy(), *(np.empty((len(index), *row), inputs[0].dtype) for row in rows))
+        self._jacobian = ProjectionJacobian(
+            index.numpy(), *(np.empty((len(index), *row), inputs[0].dtype) for row in rows)
+        )
         arguments = (lens, *inputs, widths, splats.numpy(), moments.numpy())
-        over_range(len(index), linearize_all, self._at, *arguments)
+        over_range(len(index), linearize_all, self._jacobian, *arguments)
 
     @property
     def jacobian(self) -> ProjectionJacobian:
-        return ProjectionJacobian(*map(torch.from_numpy, self._at))
+        return ProjectionJacobian(*map(torch.from_numpy, self._jacobian))
 
     @property
     def bytes(self) -> int:
-        return sum(array.nbytes for array in self._at)
+        return sum(array.nbytes for array in self._jacobian)
 
     def affects(self, block: Float[Tensor, "p k"]) -> bool:
-        """Whether a vector moves any of the Gaussians at index: mostly one of the first does."""
-        index, parts = self._at.index, self._split(block.numpy())
+        """Whether any vector is non-zero at a Gaussian of the index; the first FEW usually decide."""
+        index, parts = self._jacobian.index, self._split(block.numpy())
         return any(part[rows].any() for rows in (index[:FEW], index) for part in parts)
 
     def jvp(self, block: Float[Tensor, "p k"]) -> Float[Tensor, "n k 9"]:
-        out = np.zeros((self.n, block.shape[1], 9), self._at.jacobian.dtype)
-        over_range(len(self._at.index), push_forward, self._at, *self._split(block.numpy()), out)
+        out = np.zeros((self.n, block.shape[1], 9), self._jacobian.jacobian.dtype)
+        over_range(len(self._jacobian.index), push_forward, self._jacobian, *self._split(block.numpy()), out)
         return torch.from_numpy(out)
 
     def vjp(
@@ -341,19 +357,19 @@ class CpuProjection:
         total: Float[Tensor, "p k"] | None = None,
     ) -> Float[Tensor, "p k"]:
         if total is None:
-            total = torch.from_numpy(np.zeros((self.parameters, cotangents.shape[1]), self._at.jacobian.dtype))
+            total = torch.from_numpy(np.zeros((self.parameters, cotangents.shape[1]), self._jacobian.jacobian.dtype))
         outputs = self._split(total.numpy())
         tangents = outputs if block is None else self._split(block.numpy())
         arguments = (block is not None, cotangents.numpy(), *tangents, *outputs)
-        over_range(len(self._at.index), pull_back, self._at, *arguments)
+        over_range(len(self._jacobian.index), pull_back, self._jacobian, *arguments)
         return total
 
     def blocks(
         self, blocks: Float64[Tensor, "m 9 9"], second_order: bool
     ) -> tuple[Float[Tensor, "n 11 11"], Float[Tensor, "n b 3"]]:
         shapes = ((GEOMETRY + 1, GEOMETRY + 1), ((self.sh_degree + 1) ** 2, 3))
-        geometry, sh = (np.zeros((self.n, *shape), self._at.jacobian.dtype) for shape in shapes)
-        over_range(len(self._at.index), chain_blocks, self._at, blocks.numpy(), second_order, geometry, sh)
+        geometry, sh = (np.zeros((self.n, *shape), self._jacobian.jacobian.dtype) for shape in shapes)
+        over_range(len(self._jacobian.index), chain_blocks, self._jacobian, blocks.numpy(), second_order, geometry, sh)
         return torch.from_numpy(geometry), torch.from_numpy(sh)
 
     def _split(self, block: np.ndarray) -> tuple[np.ndarray, ...]:

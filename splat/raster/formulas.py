@@ -1,10 +1,11 @@
-"""The formulas that the compositing kernels of both compilers share: one splat in one pixel, at first and second order.
+"""Formulas shared by the compositing kernels of Numba and of Triton: one splat in one pixel, at first and second order.
 
-Per pixel, splats in order of depth, with the pixel's offset from the mean in the splat's whitened coordinates (u, v)
-(`projection/whitening.py`), opacity o, colour c, transmittance T in front of the splat:
+A prime marks a tangent (in code: d..), v_ a cotangent.  Per pixel, splats in order of depth, with the pixel's offset from the
+mean in the splat's whitened coordinates (u, v) (`projection/whitening.py`), opacity o, colour c, transmittance T in front of
+the splat:
 
     l = log2 alpha = log2 o - u^2 - v^2      alpha = min(cap, 2^l)
-    active where l >= cut and the pixel has not stopped; elsewhere alpha = 0 and every update below is a no-op
+    active where l >= cut (from alpha_min and contour) and the pixel has not stopped; else alpha = 0, and no update below acts
 
 `forward`           w = alpha T;  image += w c;  T <- T - w;  at the end image += T background, alpha plane = 1 - T.
 
@@ -21,8 +22,6 @@ Per pixel, splats in order of depth, with the pixel's offset from the mean in th
 `backward_tangent`  given q', c' and v_image'.  With tau = T' / T, r, w, beta, R as above:
                     tau <- tau + beta q';  nu = q' + tau;  h = nu v_image + v_image';  z = w (h . c + v_image . c')
                     s' = z - beta (R' + r R q'), 0 where the cap holds;  R' <- R' + z;  moments of s' and G' = sum w h.
-
-A dash marks a tangent, v_ a cotangent.  K tangents share the primal quantities of a splat.
 """
 
 from math import ceil, floor, inf, log, log2, sqrt
@@ -38,9 +37,11 @@ from splat.projection.whitening import Q0, QU, QUU, QUV, QV, QVV, ROUND
 
 SPLAT = 9  # numbers of a splat, of its tangent (six coefficients of q', colour'), and of its adjoint (six moments, G)
 WIDEN = 1e-4  # relative widening of an ellipse's level, so that no active pixel is missed
-DEGREE4, DEGREE2 = 15, 6  # how many moments u^j v^k there are up to these degrees
-CROSS = DEGREE4  # after the moments of s + v: those of w g_c + w h_c D_c, and the sums of w^2 h_c
-COLOUR = DEGREE4 + 3 * DEGREE2
+
+# The sums that make a splat's diagonal block (`cpu/blocks.py`): moments of s + v to degree 4; from CROSS, for each channel c,
+# moments of w g_c + w h_c D_c to degree 2; from COLOUR, for each channel, the sum of w^2 h_c.
+DEGREE4, DEGREE2 = 15, 6  # numbers of moments u^j v^k with j + k at most 4, and at most 2
+CROSS, COLOUR = DEGREE4, DEGREE4 + 3 * DEGREE2
 BLOCK_SUMS = COLOUR + 3
 
 LEAST_TRANSMITTANCE = {torch.float32: 1e-30, torch.float64: 1e-290}  # beneath it T would underflow
@@ -50,8 +51,9 @@ LEAST_LOG2_ALPHA = {torch.float32: -126.0, torch.float64: -1022.0}  # the range 
 class Thresholds(NamedTuple):
     """Thresholds at which a splat is drawn and a pixel stops.
 
-    alpha_min, alpha_max: bounds of alpha; contour: of the distance in standard deviations, or infinite; least: of log2 alpha;
-    free: alpha above which derivatives in ln alpha are 0, or infinite; floor: of the transmittance.
+    alpha_min, alpha_max: bounds of alpha.  contour: largest distance from the mean, in standard deviations, or infinity.
+    least: smallest log2 alpha.  free: alpha above which derivatives in ln alpha are 0, or infinity.  floor: transmittance below
+    which a pixel stops.
     """
 
     alpha_min: float
@@ -84,9 +86,10 @@ def reciprocal(x):
 
 @formula
 def alpha_row(v, terms, running, cap):
-    """alpha of a row and 2^l before the cap; running: the mask of the pixels that have not stopped.
+    """alpha of a row of pixels, and 2^l, its value before the cap; running: mask of the pixels that have not stopped.
 
-    l decides, so it is rounded alike in every kernel: fma.
+    terms: v of row 0, its step per row, log2 o - u^2, cut.  An explicit fma gives l the same rounding in every kernel, so that
+    all kernels agree on which pixels are active.
     """
     l = fma(-v, v, terms[2])
     uncapped = exp2(l)
@@ -95,12 +98,13 @@ def alpha_row(v, terms, running, cap):
 
 @formula
 def along_row(q, u):
-    """q' = A + v (B + v C) as (A, B, C), from its six coefficients."""
+    """(A, B, C) of q' = A + v (B + v C) at the column offset u, from its six coefficients q."""
     return u * (u * q[QUU] + q[QU]) + q[Q0], u * q[QUV] + q[QV], q[QVV]
 
 
 @formula
 def quadratic(v, terms):
+    """A + v (B + v C) for terms = (A, B, C)."""
     return terms[0] + v * (terms[1] + v * terms[2])
 
 
@@ -129,7 +133,7 @@ def behind_all(v_pixel, background):
 
 @formula
 def step_back(alpha, T, R, v_image, colour):
-    """A splat undone: T, R in front of it, and its w, beta, r, w e."""
+    """T and R in front of a splat, given those behind it; its w, beta, r and w e."""
     r = reciprocal(1.0 - alpha)
     T = T * r
     w = alpha * T
@@ -155,14 +159,14 @@ def step_backward_tangent(tau, dR, dv_image, w, beta, rR, dq, v_image, colour, d
 
 @formula
 def row_terms(v, s, w, h):
-    """Terms of a row in its columns' sums."""
+    """A row's terms s, s v, s v^2 and w h of the sums over rows; they depend on the column."""
     sv = s * v
     return s, sv, sv * v, w * h[0], w * h[1], w * h[2]
 
 
 @formula
 def column_terms(columns, u):
-    """The nine sums' parts of each column, from its sums over rows."""
+    """Each column's part of a splat's nine sums, from the column's sums over rows."""
     S, Sv, Svv, G0, G1, G2 = columns
     Su = S * u
     return S, Su, Sv, Su * u, Sv * u, Svv, G0, G1, G2
@@ -173,9 +177,10 @@ def column_terms(columns, u):
 
 @formula
 def second_order(q, moments, total):
-    """The tangent of a splat's six moments along the coefficients q, as the splat itself moves.
+    """Tangent of a splat's six moments along the coefficients q.
 
-    moments: those of the gradient, over offsets from the splat; total: of s' over the offsets from where it was.
+    moments: of s; total: moments of s' at fixed offsets.  The other terms are due to the offsets, which are relative to the
+    splat and change as it moves.
     """
     S, Su, Sv = moments[0], moments[1], moments[2]
     u, v = q[QU] / ROUND, q[QV] / ROUND
@@ -194,7 +199,10 @@ def second_order(q, moments, total):
 
 @formula
 def ellipse_of(splat, alpha_min, contour):
-    """Half-extents of a splat's ellipse and its widened level; a level of 0 where it is nowhere drawn."""
+    """Half-extents (px) in x and y of the ellipse in which a splat is drawn, its level and the conic's determinant.
+
+    level: bound of d . Q d for offsets d from the mean, slightly widened; 0 where the splat is drawn nowhere.
+    """
     a, b, c, opacity = splat[2], splat[3], splat[4], splat[5]
     drawn = (opacity >= alpha_min) & (opacity > 0)
     level = min(contour * contour, 2 * log(select(drawn, opacity, 1.0) / alpha_min))
@@ -229,7 +237,7 @@ def rows_in_strip(splat, level, det, ey, left, right):
 
 @formula
 def rows_of_strip(splat, ellipse, column, tile, width, height):
-    """First and last pixel row of a splat's ellipse in a column of tiles; empty if first > last."""
+    """First and last pixel row of a splat's ellipse in a column of tiles, `tile` pixels wide; empty if first > last."""
     ex, ey, level, det = ellipse
     mx, my = splat[0] - 0.5, splat[1] - 0.5
     x0, x1 = pixels_within(mx, ex, width)
@@ -251,59 +259,56 @@ def box_of(splat, ellipse, width, height):
 # --- a splat's diagonal block of the Hessian --------------------------------------------------------------------------
 
 
-def _moment_index() -> np.ndarray:
-    """Index of the moment of u^j v^k among the fifteen, by [j, k]: powers of v outermost, as `store_powers` leaves them."""
-    index = np.full((5, 5), -1, np.int64)
-    place = 0
-    for k in range(5):
-        for j in range(5 - k):
-            index[j, k] = place
-            place += 1
+def _moment_index(degree: int) -> np.ndarray:
+    """Place [j, k] of the moment of u^j v^k among those to a degree, in the order of `store_powers`: 1, u, ..., v, u v, ..."""
+    index, powers = np.full((degree + 1, degree + 1), -1), range(degree + 1)
+    for place, (j, k) in enumerate((j, k) for k in powers for j in powers if j + k <= degree):
+        index[j, k] = place
     return index
 
 
-MOMENT = _moment_index()
-MOMENT2 = np.array([[0, 3, 5], [1, 4, -1], [2, -1, -1]])  # of the six of degree 2, stored alike: 1, u, u^2, v, u v, v^2
-
-
 def _block_index() -> np.ndarray:
-    """Index of a splat's sum for each entry of its diagonal block, (9, 9) over coefficients and colour; BLOCK_SUMS: 0."""
-    powers = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of u and v in q', by Q0, QU, ...
+    """Place of each entry of a splat's diagonal block (9, 9) among its BLOCK_SUMS sums; the place BLOCK_SUMS stands for 0.
+
+    Rows and columns: the coefficients Q0, QU, ..., then the three channels of the colour.
+    """
+    powers = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of u and v, in the order Q0, QU, QV, QUU, QUV, QVV
+    degree4, degree2 = _moment_index(4), _moment_index(2)
     index = np.full((9, 9), BLOCK_SUMS, np.int64)
     for p, (j, k) in enumerate(powers):
         for r, (j2, k2) in enumerate(powers):
-            index[p, r] = MOMENT[j + j2, k + k2]
+            index[p, r] = degree4[j + j2, k + k2]
         for c in range(3):
-            index[6 + c, p] = index[p, 6 + c] = CROSS + DEGREE2 * c + MOMENT2[j, k]
+            index[6 + c, p] = index[p, 6 + c] = CROSS + DEGREE2 * c + degree2[j, k]
     for c in range(3):
         index[6 + c, 6 + c] = COLOUR + c
     return index
 
 
-def _bends() -> np.ndarray:
-    """sum s d2q of a splat, (3, 9, 9) over its coefficients: factors of its moments S, Su, Sv (`second_order`)."""
-    bends = np.zeros((3, 9, 9))
+def _d2q() -> np.ndarray:
+    """Factors (3, 9, 9) of the moments S, Su, Sv in sum s d2q, the curvature of q in its coefficients (`second_order`)."""
+    factors = np.zeros((3, 9, 9))
     terms = (
         (0, Q0, Q0, -1.0), (0, QU, QU, -1 / ROUND), (0, QV, QV, -1 / ROUND), (1, QU, QUU, -2 / ROUND),
         (2, QU, QUV, -1 / ROUND), (1, QV, QUV, -1 / ROUND), (2, QV, QVV, -2 / ROUND),
     )  # fmt: skip
     for moment, p, r, factor in terms:
-        bends[moment, p, r] = bends[moment, r, p] = factor
-    return bends
+        factors[moment, p, r] = factors[moment, r, p] = factor
+    return factors
 
 
-BLOCK_INDEX, BENDS = _block_index(), _bends()
+BLOCK_INDEX, D2Q = _block_index(), _d2q()
 
 
 @formula
 def colour_slopes(free, beta, R, colour):
-    """D, the colours' derivatives in q.  free: w where the cap does not hold, else 0; beta likewise."""
+    """D_c = dI_c / dq of the three channels; free, beta: w and beta where the cap does not hold, else 0."""
     return free * colour[0] - beta * R[0], free * colour[1] - beta * R[1], free * colour[2] - beta * R[2]
 
 
 @formula
 def step_block(w, free, beta, R, g, h, colour):
-    """D, R in front of the splat, and s + v."""
+    """D (three channels), the colour R in front of the splat, and s + v of `cpu/blocks.py`; g, h: of the image's loss."""
     D = colour_slopes(free, beta, R, colour)
     weight = D[0] * (g[0] + h[0] * D[0]) + D[1] * (g[1] + h[1] * D[1]) + D[2] * (g[2] + h[2] * D[2])
     return D, plus(R, w, colour), weight
@@ -311,6 +316,6 @@ def step_block(w, free, beta, R, g, h, colour):
 
 @formula
 def cross_terms(w, free, D, g, h):
-    """w g_c + w h_c D_c and w^2 h_c of a channel."""
+    """w g_c + w h_c D_c and w^2 h_c of a channel c."""
     wh = w * h
     return free * g + wh * D, w * wh

@@ -1,8 +1,8 @@
-"""Checkpoints: a training under way and a reference to its scene, in one file.
+"""Checkpoints: the state of a training and a reference to its scene, in one file.
 
-The file is a `torch.save` of tensors and plain types, loaded with `weights_only=True` (nothing in it can run code), and
-written whole or not at all.  Its checksums are compared, which torch leaves out.  The same training gives the same bytes.
-Its keys are the fields of `_File` and of `_Training`, side by side.
+The file is a `torch.save` of a dictionary of tensors and plain types; its keys are the fields of `_File` and `_Training`.  It
+is written atomically, and loaded with `weights_only=True`, so that nothing in it can run code, after a test of its checksums,
+which torch omits.  The same training gives the same bytes.
 """
 
 import errno
@@ -36,7 +36,7 @@ from splat.training.state import Method, ThreeDGS, TrainConfig, Training
 
 FORMAT, VERSION = "splat-landscape checkpoint", 2
 KIND = "expected a checkpoint written by landscape train"
-# settings that older files lack, where the training was the one of their defaults
+# settings that older files may lack: those trainings had what are now the defaults
 LATER = {
     "protocol",
     "loss.border",
@@ -53,10 +53,10 @@ REMEDY = "take another copy of the file, or train anew"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Checkpoint(Brief):
-    """A training as it was saved, the scene that it belongs to, and the version of torch that wrote it.
+    """A saved training, its scene, and the version of torch that wrote it.
 
-    origin: of another tool's file, what was assumed (`foreign_training`).  all_views: how many views it was trained on, where
-    the scene names fewer (`thinned`).
+    origin: what was assumed of another tool's file (`foreign_training`).  all_views: number of views that it was trained on,
+    where the scene names fewer (`thinned`).
     """
 
     training: Training
@@ -70,11 +70,11 @@ class Checkpoint(Brief):
         """Sentences on what was assumed of another tool's file."""
         if self.origin is None:
             return []
-        said = "trained by {trained_by} ({trained_by_source}), training views: {views}; {psnr:.1f} dB on two of them"
-        return [said.format(**self.origin), *self.origin["notes"]]
+        summary = "trained by {trained_by} ({trained_by_source}), training views: {views}; {psnr:.1f} dB on two of them"
+        return [summary.format(**self.origin), *self.origin["notes"]]
 
     def thinned(self, scene: Scene, count: int | None) -> "Checkpoint":
-        """Checkpoint with at most so many of its training views, spread evenly over their cameras; None: all."""
+        """The same with at most `count` of its training views, spread evenly over their cameras; None: all."""
         if count is None or count >= len(self.scene.train):
             return self
         chosen = set(spread_views(scene.select(self.scene.train), count))
@@ -85,13 +85,13 @@ class Checkpoint(Brief):
         return replace(self, scene=scene_of_these, all_views=self.all_views or len(self.scene.train))
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
-        """The scene that this checkpoint, read from path, belongs to, see `SceneReference.load`."""
+        """The scene of this checkpoint, which was read from path; see `SceneReference.load`."""
         return self.scene.load(path, self.training.config.background, scene)
 
 
 @dataclass(frozen=True)
 class _Moments:
-    """Adam's, (p,) each, and the number of updates."""
+    """Adam's moments, (p,) each, and its number of updates."""
 
     first: Tensor
     second: Tensor
@@ -100,7 +100,7 @@ class _Moments:
 
 @dataclass(frozen=True)
 class _ScreenGradients:
-    """(n,) each, see `ScreenGradients`."""
+    """`ScreenGradients`, (n,) each."""
 
     total: Tensor
     renders: Tensor
@@ -110,10 +110,10 @@ class _ScreenGradients:
 class _Training:
     """A training of n Gaussians with p stored parameters, as `training_state` writes it.
 
-    step: steps made; extent: radius of the scene's cameras, world units.  sh_degree, flat: the Gaussians, bands in use and (p,)
-    stored parameters.  generator: state of the random generator, uint8; order: views still to come in this epoch.
-    regularizer: `Method.state`, a training in it (a second field) in this same form.  config: `TrainConfig` as plain types.
-    filter_widths: of the Gaussians, where they have any.
+    step: number of steps made.  extent: radius of the scene's cameras, world units.  sh_degree, flat, filter_widths: see
+    `Gaussians`.  generator: state of the random generator, uint8.  order: indices of views still to come in this epoch.
+    regularizer: `Method.state`; a training in it (such as a second set of Gaussians) has this same form.  config: `TrainConfig`
+    as plain types.
     """
 
     step: Count
@@ -131,9 +131,10 @@ class _Training:
 
 @dataclass(frozen=True)
 class _File:
-    """The keys beside those of the training.  version: 1 knew no methods, so that there is no `regularizer`: it is 3DGS.
+    """The keys beside those of the training.
 
-    torch: the version that wrote the file; scene: `SceneReference` as plain types.
+    version: of the format; 1 is 3DGS without `regularizer`, from before there were methods.  torch: the version that wrote the
+    file.  scene: `SceneReference` as plain types.
     """
 
     format: str
@@ -143,7 +144,7 @@ class _File:
 
 
 def training_state(training: Training) -> dict[str, Any]:
-    """All that a training depends on, as tensors and plain types: the fields of `_Training`."""
+    """The state of a training as tensors and plain types: the fields of `_Training`."""
     adam, screen, widths = training.adam, training.screen_gradients, training.gaussians.filter_widths
     return {
         **({} if widths is None else {"filter_widths": widths}),
@@ -164,7 +165,7 @@ def training_state(training: Training) -> dict[str, Any]:
 
 
 def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> None:
-    """Write the checkpoint, replacing one that is there only once the new one is complete on disk."""
+    """Write the checkpoint atomically: an existing file is replaced once the new one is complete on disk."""
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -172,13 +173,13 @@ def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> No
         **training_state(training),
         "scene": asdict(scene),
     }
-    buffer = io.BytesIO()  # torch writes the name of a file into it
+    buffer = io.BytesIO()  # in place of a file, whose name torch would write into it
     torch.save(_interned(content), buffer)
     write_atomically(path, buffer.getvalue())
 
 
 def _interned(content: Any) -> Any:
-    """The same content with one object for equal strings: pickle writes a string that it has met as a reference to it."""
+    """The same content with one object for equal strings; else pickle's references, and so the bytes, would vary."""
     if isinstance(content, dict):
         return {_interned(key): _interned(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
@@ -187,7 +188,7 @@ def _interned(content: Any) -> Any:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Put content at path, whole or not at all (`replacing`)."""
+    """Write content to path, whole or not at all (`replacing`)."""
     with replacing(path) as partial:
         partial.write_bytes(content)
 
@@ -195,7 +196,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:
     """The checkpoint of `load_checkpoint`, or another tool's file as one; ask, picture: see `foreign_training`.
 
-    InputError too where our own is given what only another's needs.
+    InputError also where ask has options for another tool's file, and path is a checkpoint.
     """
     if is_foreign(path):
         training, scene, origin = foreign_training(path, ask, picture)
@@ -211,8 +212,8 @@ def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:
 def load_checkpoint(path: str | Path) -> Checkpoint:
     """Read a checkpoint, its tensors on the CPU.
 
-    OSError where there is none or the system does not give it, MemoryError or torch's where memory is short; InputError, which
-    says what is wrong with it, where it is damaged or of another kind.
+    OSError where there is none or it cannot be read; MemoryError, or torch's error, where memory is short; InputError, which
+    says what is wrong, where it is damaged or of another kind.
 
     >>> load_checkpoint("nowhere/checkpoint.pt")
     Traceback (most recent call last):
@@ -231,7 +232,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def _instead(path: Path) -> str:
-    """Words on what there is in place of a checkpoint, and what to name."""
+    """Description of what is at path in place of a checkpoint, and which path to name instead."""
     if not path.exists():
         near = path.parent if path.name == "checkpoint.pt" else path
         beside = [each.name for each in near.parent.iterdir()] if near.parent.is_dir() else []
@@ -246,15 +247,15 @@ def _instead(path: Path) -> str:
 
 
 def _read(file: BinaryIO, path: Path) -> Any:
-    """The content that torch saved, after its checksums were found to be right."""
+    """The content that torch saved, after a test of its checksums."""
     try:
         with zipfile.ZipFile(file) as archive:
             require_whole(archive)
         file.seek(0)
-        with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
+        with warnings.catch_warnings(action="ignore"):  # torch warns of other kinds of pickle before it refuses them
             return torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # a file of another kind fails in torch in as many ways
-        bad_seek = isinstance(error, OSError) and error.errno == errno.EINVAL  # to where a damaged index points
+    except Exception as error:  # files of other kinds fail in torch with errors of many kinds
+        bad_seek = isinstance(error, OSError) and error.errno == errno.EINVAL  # caused by a damaged index
         if lacks_memory(error) or (isinstance(error, OSError) and not bad_seek):
             raise
         ply = " (of other tools' files, probe, slice and convert read those)" if path.suffix.lower() == ".ply" else ""
@@ -263,14 +264,15 @@ def _read(file: BinaryIO, path: Path) -> Any:
 
 
 def _checkpoint(content: Any) -> Checkpoint:
+    """The checkpoint with this content.  InputError that says what is wrong with it."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"it does not hold the format {FORMAT!r}")
     file = typed(_File, content)
     if file.version not in (1, VERSION):
         raise InputError(f"its format version is {file.version}, this program reads up to {VERSION}")
     if file.version == 1:
-        plain, config = ThreeDGS(), typed(dict[str, Any], content.get("config"), "config")
-        content = {**content, "config": {**config, "method": asdict(plain)}, "regularizer": plain.create(0).state()}
+        method, config = ThreeDGS(), typed(dict[str, Any], content.get("config"), "config")
+        content = {**content, "config": {**config, "method": asdict(method)}, "regularizer": method.create(0).state()}
     training, scene = restored_training(content), file.scene
     for each in ("sizes", "photographs"):
         found = getattr(scene, each)
@@ -282,7 +284,7 @@ def _checkpoint(content: Any) -> Checkpoint:
 
 
 def restored_training(content: dict[str, Any]) -> Training:
-    """The training of a state.  InputError that says what is wrong with it."""
+    """The training of a `training_state`.  InputError that says what is wrong with it."""
     saved = typed(_Training, content)
     adam, screen, p, dtype = saved.adam, saved.screen_gradients, saved.flat.numel(), saved.flat.dtype
     gaussians = Gaussians(_numbers("flat", saved.flat, p, dtype), saved.sh_degree)
@@ -313,7 +315,7 @@ def restored_training(content: dict[str, Any]) -> Training:
 
 
 def _config(content: dict[str, Any]) -> TrainConfig:
-    """The settings: every one of today's has to be there, but for those that older files did not know."""
+    """The settings of a training: all have to be there, except LATER and `MethodSettings.BEFORE`."""
     method, render = (typed(dict[str, Any], content.get(key), f"config.{key}") for key in ("method", "render"))
     name = typed(str, method.get("name"), "config.method.name")
     if name not in METHODS:
@@ -327,11 +329,11 @@ def _config(content: dict[str, Any]) -> TrainConfig:
 
 
 def _method(config: TrainConfig, state: dict[str, Any]) -> Method:
-    """The method with its state, in which what has a method is a training."""
+    """The method with its state; a dictionary with a "regularizer" in it is a training."""
     method = config.method.create(config.seed)
-    inner = {key: value for key, value in state.items() if isinstance(value, dict) and "regularizer" in value}
+    trainings = {key: value for key, value in state.items() if isinstance(value, dict) and "regularizer" in value}
     try:
-        method.restore(state | {key: restored_training(value) for key, value in inner.items()})
+        method.restore(state | {key: restored_training(value) for key, value in trainings.items()})
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         if lacks_memory(error):
             raise
@@ -347,7 +349,7 @@ def _generator(state: Tensor) -> torch.Generator:
 
 
 def _numbers(key: str, value: Tensor, count: int, dtype: torch.dtype, least: float | None = None) -> Tensor:
-    """The tensor, if it holds so many numbers of this type in memory, one by one; least: also finite, and not below this."""
+    """The tensor, if it has shape (count,) and dtype, is contiguous and on the CPU; least: also finite and not below this."""
     if value.is_nested or value.layout != torch.strided or value.requires_grad:
         raise InputError(f"'{key}' is a tensor of another kind than numbers in a row")
     kind = f"{value.dtype} of shape {tuple(value.shape)}"

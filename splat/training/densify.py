@@ -10,13 +10,13 @@ With `split_distance`, a Gaussian far from its neighbours is split too, whatever
     mean squared distance to the three nearest > split_distance x extent,   largest scale > extent
 
 Then Gaussians that are nearly transparent are removed, and, once opacities have been reset, those larger than
-prune_scale x extent.  (The published code also means to remove what is large on screen, but zeroes the radii before it
-looks at them, so that it never does.)  Opacities are lowered to reset_opacity every `reset_every` steps before `stop`;
-on a white background, which the first Gaussians are quick to stand in for, also at the step `start`.
+prune_scale x extent.  (The published code is meant to remove Gaussians that are large on screen too, but never does: it zeroes
+their radii before the test.)  Opacities are lowered to reset_opacity every `reset_every` steps before `stop`; on a white
+background, which the first Gaussians soon imitate, also at the step `start`.
 
 The screen-space gradient is the norm of dL / d(mean) in normalised device coordinates, in which the image is 2 wide and
-2 high, averaged over the renders in which the Gaussian's 3-sigma box meets the image.  Splat means here are in pixels,
-so that gradient is (w/2 dL/dx, h/2 dL/dy).  extent: radius of the cameras' bounding sphere, world units.
+2 high, averaged over the renders in which the Gaussian's 3-sigma box meets the image.  Splat means (x, y) are in pixels, so
+this gradient is (w/2 dL/dx, h/2 dL/dy).  extent: radius of the cameras' bounding sphere, world units.
 """
 
 from dataclasses import dataclass
@@ -36,23 +36,23 @@ from splat.model.typed import Count, Length, Positive, Settings, Share
 from splat.projection.antialias import filter_factor
 from splat.projection.reference import Splats, on_screen, rotation_matrices
 
-SPLIT_INTO = 2
-SPLIT_SHRINK = 0.8 * SPLIT_INTO
-NEIGHBOURS = 3
+SPLIT_INTO = 2  # Gaussians
+SPLIT_SHRINK = 0.8 * SPLIT_INTO  # divisor of scales
+NEIGHBOURS = 3  # in the mean squared distance
 
 
 @dataclass(frozen=True)
 class DensifySettings(Settings):
     """Settings of density control in a run of T steps: after min(start, start_share T), before min(stop, stop_share T).
 
-    The interval is `every`, but at most every_share T.  3DGS trains for 30,000 steps, where the shares change nothing;
-    with them short runs densify too, and have half of their steps to settle.
+    The interval is `every`, but at most every_share T.  In the 30,000 steps of 3DGS the shares change nothing; with them short
+    runs densify too, and have half of their steps to settle.
 
     gradient_threshold: of the mean screen-space gradient, in normalised device coordinates.  clone_scale, prune_scale: in units
-    of the extent; split_distance: its squared distances are in units of extent x world unit.  min_opacity: below it a Gaussian
-    is removed; grow_opacity: only above it one is cloned, or split for its gradient; reset_opacity: what a reset lowers
-    opacities to.  first_reset: step of the first reset, None: reset_every.  None elsewhere: nothing is removed for its size,
-    split for its distance, or reset.
+    of the extent; None: no Gaussian is removed for its size.  split_distance: in world units, see above; None: none is split
+    for its distance.  min_opacity: Gaussians below it are removed.  grow_opacity: only Gaussians above it are cloned, or split
+    for their gradient.  reset_opacity: highest opacity after a reset; None: no resets.  first_reset: step of the first reset;
+    None: reset_every.
     """
 
     enabled: bool = True
@@ -81,32 +81,33 @@ class DensifySettings(Settings):
             )
 
     def collects(self, step: int, iterations: int) -> bool:
-        """Whether density control is under way, and wants the screen-space gradient, at a step (1, 2, ...)."""
+        """Whether the screen-space gradient of a step (1, 2, ...) counts: density control is on and has not stopped."""
         return self.enabled and step < min(self.stop, self.stop_share * iterations)
 
     def begins(self, iterations: int) -> int:
-        """The last step before Gaussians are cloned, split and removed."""
+        """The last step before the first in which Gaussians can be cloned, split and removed."""
         return floor(min(self.start, self.start_share * iterations))
 
     def densifies(self, step: int, iterations: int) -> bool:
+        """Whether Gaussians are cloned, split and removed after a step."""
         begun = step > self.begins(iterations)
         interval = max(1, min(self.every, round(self.every_share * iterations)))
         return begun and step % interval == 0 and self.collects(step, iterations)
 
     def resets_opacity(self, step: int, iterations: int, *, white: bool) -> bool:
-        """white: whether that is what the views are seen against."""
+        """Whether opacities are lowered after a step; white: whether the background is white."""
         since = step - (self.first_reset or self.reset_every)
         due = (since >= 0 and since % self.reset_every == 0) or (white and step == self.begins(iterations))
         return due and self.reset_opacity is not None and self.collects(step, iterations)
 
     def prunes_large(self, step: int) -> bool:
-        """3DGS removes large Gaussians only after the first opacity reset."""
+        """Whether large Gaussians are removed at a step: only after the first reset of opacities."""
         return self.prune_scale is not None and step > (self.first_reset or self.reset_every)
 
 
 @dataclass(eq=False)
 class ScreenGradients:
-    """Sum of the screen-space gradient's norms and number of renders that they come from, per Gaussian."""
+    """For each Gaussian, the sum of the norms of screen-space gradients, and the number of renders in it."""
 
     total: Float[Tensor, " n"]
     renders: Float[Tensor, " n"]
@@ -117,7 +118,7 @@ class ScreenGradients:
 
     @torch.no_grad()
     def add(self, gradient: Float[Tensor, "n 2"], splats: Splats, camera: Camera) -> None:
-        """Take in dL / d(splats.means) of one render."""
+        """Add dL / d(splats.means) of one render, per pixel."""
         half_size = torch.tensor([camera.width / 2, camera.height / 2], dtype=gradient.dtype)
         half_size = half_size.to(gradient.device, non_blocking=True)
         visible = on_screen(splats, camera)
@@ -126,13 +127,17 @@ class ScreenGradients:
 
     @property
     def mean(self) -> Float[Tensor, " n"]:
-        """Zero for Gaussians that no render showed."""
+        """Mean norm; 0 for Gaussians in no render."""
         return self.total / self.renders.clamp_min(1)
 
 
 @dataclass(frozen=True, eq=False)
 class Densified:
-    """gaussians: the new set; parents: which old Gaussian each comes from; fresh: which are new, not carried over."""
+    """Result of density control.
+
+    gaussians: the new set.  parents: index of the old Gaussian that each comes from.  fresh: which are not kept, but clones or
+    draws.  cloned, split, pruned: numbers of Gaussians.
+    """
 
     gaussians: Gaussians
     parents: Int[Tensor, " n"]
@@ -152,7 +157,7 @@ def densify(
     *,
     prune_large: bool,
 ) -> Densified:
-    """Clone, split and prune.  gradients: `ScreenGradients.mean`.  Kept Gaussians come first, in their order."""
+    """Clone, split and prune.  gradients: `ScreenGradients.mean`.  Kept Gaussians come first, in their old order."""
     high = (gradients > settings.gradient_threshold) & (gaussians.opacity_logits.sigmoid() > settings.grow_opacity)
     largest = gaussians.log_scales.amax(dim=1)
     small = largest <= log(settings.clone_scale * extent)
@@ -176,7 +181,7 @@ def densify(
 
 
 def neighbours(gaussians: Gaussians, count: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
-    """Distances between the means to the nearest others, world units, and which they are.  k: count, at most n - 1."""
+    """Distances from each mean to the nearest others, world units, and their indices.  k: min(count, n - 1)."""
     means = gaussians.means.cpu().double().numpy()
     wanted = list(range(2, min(count, len(means) - 1) + 2))  # the nearest is the Gaussian itself
     found = scipy.spatial.KDTree(means).query(means, k=wanted)
@@ -185,7 +190,7 @@ def neighbours(gaussians: Gaussians, count: int) -> tuple[Float[Tensor, "n k"], 
 
 
 def draw_from_parents(gaussians: Gaussians, start: int, generator: torch.Generator) -> None:
-    """Turn the exact copies from `start` on into draws from the Gaussians they copy, smaller by 1.6; in place."""
+    """Replace the copies from `start` on, in place, by draws from the Gaussians they copy, with scales / 1.6."""
     means, log_scales = gaussians.means[start:], gaussians.log_scales[start:]
     noise = torch.randn(means.shape, dtype=means.dtype, generator=generator).to(means.device) * log_scales.exp()
     means += (rotation_matrices(gaussians.quats[start:]) @ noise[:, :, None])[:, :, 0]
@@ -194,7 +199,7 @@ def draw_from_parents(gaussians: Gaussians, start: int, generator: torch.Generat
 
 @torch.no_grad()
 def reset_opacities(gaussians: Gaussians, opacity: float) -> None:
-    """Lower every opacity to at most this, in place; with a 3-D filter, as Mip-Splatting does, the opacity under it."""
+    """Lower every opacity to at most this, in place; with a 3-D filter, the filtered opacity, as in Mip-Splatting."""
     if gaussians.filter_widths is None:
         gaussians.opacity_logits.clamp_max_(log(opacity / (1 - opacity)))
         return

@@ -1,10 +1,11 @@
 """Settings and state of a training of 3D Gaussian Splatting, and the interface of the methods that add to it.
 
-TrainConfig, MethodSettings    plain values: all that the result depends on beside the start and the views
-Training, Method               the state that changes from step to step; `Method` holds the method's part
+TrainConfig, MethodSettings    plain values; with the start and the views they determine the result
+Training, Method               the state that changes from step to step; `Method` has the method's part of it
 Step                           one step: its number, its view, its loss
 
-The loop (`splat/training/loop.py`) makes the steps; a checkpoint (`splat/training/checkpoint.py`) holds all of it.
+The loop (`splat/training/loop.py`) makes the steps; a checkpoint (`splat/training/checkpoint.py`) contains config and state.
+Steps count from 1.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -37,16 +38,18 @@ from splat.training.densify import Densified, DensifySettings, ScreenGradients, 
 from splat.training.optim.adam import Adam
 
 FILTER_EVERY = 100  # steps
-LOSS_PLANES, LOSSES = 9, 0.25  # of a target and its moments; a share of the free memory
+LOSS_PLANES = 9  # planes that a loss keeps: of a target and its moments
+LOSSES = 0.25  # share of the free memory that losses may take
 Protocol = Literal["common", "llff"]
-Row = dict[str, Count | float | bool | str]  # of a history
+Row = dict[str, Count | float | bool | str]  # of `Method.history`
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of a training.  number: from 1; chosen: index in `views` of the sampled view.
+    """One step of a training.
 
-    gaussians: before the update.  background: RGB; loss: against the sampled view's image on that background.
+    number: from 1.  gaussians: before the update.  chosen: index in `views` of the sampled view.  background: RGB.  loss:
+    against the sampled view's image on that background.
     """
 
     number: int
@@ -79,8 +82,8 @@ class Step:
 class MethodSettings(Settings):
     """Settings of a method; `create` makes a `Method` from them.  name: its key in `methods.METHODS`.
 
-    BEFORE: values for settings that older checkpoints lack, with which the method does the same as it did then.
-    ITERATIONS: steps of a training that is not told how many.
+    ITERATIONS: default number of steps.  BEFORE: values of settings that older checkpoints lack, with which the method does
+    what it did when they were written.
     """
 
     name: str = ""
@@ -92,7 +95,7 @@ class MethodSettings(Settings):
         return Method(self, seed)
 
     def parts(self, config: "TrainConfig") -> dict[str, int]:
-        """Steps before each part of the method begins, by the name of the setting; parts that are switched off are left out."""
+        """Number of steps before each part of the method begins, by the part's setting; without parts that are off."""
         return {self.name: 0}
 
     def density_control(self, config: "TrainConfig") -> DensifySettings:
@@ -108,22 +111,22 @@ S = TypeVar("S", bound=MethodSettings)
 
 
 class Method(Generic[S]):
-    """Additions of a method to 3DGS, and its state between steps.  This base adds nothing: it is 3DGS.
+    """Additions of a method to 3DGS, and its state between steps.  This base class adds nothing: it is 3DGS.
 
     hook            runs                                      arguments          result
     on_start        before the first step, after a resume     training, views    InputError where views lack what it needs
-    own_step        in place of all up to after_step          step               the loss before it; None: as 3DGS does
+    own_step        in place of all up to after_step          step               the loss before it; None: do a step of 3DGS
     opacity_scale   before the sampled view is rendered       step               (n,) factors on the opacities, or None
     gradient        after its backward pass, before Adam      step, base         loss and gradient to go on with
     on_densify      after each change of the Gaussians        change             which old one each new one comes from
     after_step      after Adam and density control            step
 
-    The hook `gradient` returns a loss with two gradients: Adam descends its `gradient`, density control counts its
+    The hook `gradient` returns a loss with two gradients: Adam descends its `gradient`, density control averages its
     `screen_gradient`.
 
-    generator: for everything that the method draws.  It is not the training's, so that with the same seed every method sees
-    the same views in the same order and splits the same Gaussians alike.  history: rows to look at afterwards, each with its
-    "step"; `landscape train` writes them to history.csv.  Both are in `state`; `restore` continues from it to the same bits.
+    generator: for all random numbers of the method.  It is not the training's, so that with the same seed every method sees the
+    same views in the same order and splits the same Gaussians alike.  history: rows, each with its "step", which
+    `landscape train` writes to history.csv.  Both are in `state`; after `restore` a training continues to the same bits.
     """
 
     def __init__(self, settings: S, seed: int):
@@ -132,7 +135,7 @@ class Method(Generic[S]):
         self.history: list[dict[str, Any]] = []
 
     def on_start(self, training: "Training", views: Sequence[View]) -> None:
-        """A second call changes nothing."""
+        """Prepare; a second call must change nothing."""
 
     def own_step(self, step: Step) -> float | None:
         """Change step.training.gaussians, in place, without the sampled view, Adam and density control."""
@@ -150,11 +153,11 @@ class Method(Generic[S]):
     def after_step(self, step: Step) -> None: ...
 
     def state(self) -> dict[str, Any]:
-        """Tensors, plain values and trainings."""
+        """What `restore` takes, by name: tensors, plain values and trainings."""
         return {"generator": self.generator.get_state(), "history": self.history}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a state.  ValueError, KeyError, TypeError or RuntimeError where it is not one of this method."""
+        """Continue from a state.  ValueError, KeyError, TypeError or RuntimeError where it is not one of this method."""
         self.generator.set_state(state["generator"])
         self.history = typed(list[Row], state["history"], "history")
         if not all(type(row.get("step")) is int and type(row.get("count", 0)) is int for row in self.history):
@@ -163,18 +166,17 @@ class Method(Generic[S]):
 
 @dataclass(frozen=True)
 class ThreeDGS(MethodSettings):
-    """3D Gaussian Splatting as it is (Kerbl et al. 2023)."""
+    """3D Gaussian Splatting (Kerbl et al. 2023) without additions."""
 
     name: Literal["3dgs"] = "3dgs"
 
 
 @dataclass(frozen=True)
 class LearningRates(Settings):
-    """Adam's rates of 3DGS, about what a step changes a stored parameter by.
+    """Learning rates of Adam in 3DGS: about the change of a stored parameter in a step.
 
     position, position_final: per unit of the scene's extent, at the first step and at the last.  position_hold: steps before
-    the first of them begins to fall.  sh_constant, sh_higher: of the
-    SH band of degree 0 and of those above.
+    the rate begins to fall.  sh_constant, sh_higher: for the SH band of degree 0 and for those above.
     """
 
     position: Positive = 1.6e-4
@@ -191,12 +193,12 @@ class LearningRates(Settings):
 class TrainConfig(Settings):
     """Everything that a training's result depends on beside its start and its views.
 
-    sh_degree: the highest SH degree, 0 to 3; one is added every sh_degree_every steps, from 0.
-    background: the colour that the views were composited over, RGB in [0, 1], drawn behind the Gaussians.
-    random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
-    clamp_image: the loss of a step is that of the image clamped to [0, 1]; the objective whose Hessian is studied never clamps.
-    protocol: whose training this is: that which is common to all methods, or a published one (`methods/protocols.csv`), which
-        set the other settings.
+    sh_degree: the highest SH degree, 0 to 3; training begins with 0 and adds one every sh_degree_every steps.
+    background: the colour that the views were composited over, RGB in [0, 1]; it is drawn behind the Gaussians.
+    random_background: draw another colour each step, behind the Gaussians and behind views that have an alpha channel.
+    clamp_image: clamp the image to [0, 1] in the loss of a step; the objective whose Hessian is studied never clamps.
+    protocol: name of the training protocol, which has set the other settings: common to all methods, or a published one
+        (`methods/protocols.csv`).
     method: what is added to 3DGS, with its settings (`splat/training/methods/methods.py`).
     InputError where a setting is out of its range.
 
@@ -228,12 +230,12 @@ class TrainConfig(Settings):
         return torch.tensor(self.background, dtype=dtype)
 
     def loss_against(self, image: Float[Tensor, "3 h w"], like: Tensor) -> ViewLoss | Clamped:
-        """The loss that a step descends, against a view's image; like: see `loss_against`."""
+        """The loss of a step against a view's image; like: see `splat.losses.autograd.loss_against`."""
         loss = loss_against(image, self.loss, like)
         return Clamped(loss) if self.clamp_image else loss
 
     def losses_against(self, views: Sequence[View], like: Tensor) -> Callable[[int], ViewLoss | Clamped]:
-        """The same of the view of an index, where those that were used last are kept: as many as have room."""
+        """A function from a view's index to `loss_against` its image; it caches as many losses as LOSSES allows."""
         each = LOSS_PLANES * like.element_size() * max(view.camera.width * view.camera.height for view in views)
         most = max(1, int(LOSSES * free_memory(like.device)) // each)
         return lru_cache(min(most, len(views)))(lambda index: self.loss_against(views[index].image, like))
@@ -250,10 +252,10 @@ class TrainConfig(Settings):
 
 @dataclass(eq=False, repr=False)
 class Training(Brief):
-    """A training under way: all that its next step depends on.
+    """State of a training: all that its next step depends on.
 
     extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.
-    order: indices of the epoch's views still to come, last first.
+    order: indices of the views still to come in this epoch, last first.
 
     >>> from splat import Gaussians
     >>> Training.start(Gaussians(torch.ones(14), sh_degree=0), extent=1.0, config=TrainConfig()).step
@@ -272,9 +274,10 @@ class Training(Brief):
 
     @classmethod
     def start(cls, gaussians: Gaussians, extent: float, config: TrainConfig) -> "Training":
-        """A training before its first step.  The Gaussians are copied; extent: world units, as of `Scene.extent`.
+        """A training before its first step.  gaussians: copied; extent: world units, see `Scene.extent`.
 
-        InputError where there are no Gaussians, one is not finite, or their SH degree is above the training's.
+        InputError where there are no Gaussians, one is not finite, their SH degree is above the training's, or extent is not
+        positive and finite.
         """
         if len(gaussians) == 0:
             raise InputError("expected at least one Gaussian to start from, got none; use a random start")
@@ -307,13 +310,13 @@ class Training(Brief):
         self.screen_gradients = ScreenGradients(gradients.total.to(device), gradients.renders.to(device))
 
     def next_view(self, count: int) -> int:
-        """Index of the next view; every view once before any again."""
+        """Index of the next of `count` views; each comes once per epoch, in random order."""
         if not self.order:
             self.order = torch.randperm(count, generator=self.generator).tolist()
         return self.order.pop()
 
     def descend(self, gradient: Float[Tensor, " p"], step: int) -> None:
-        """Update every parameter with Adam in place, at the rates of this step (counted from 1)."""
+        """Update every parameter in place with Adam, at the rates of this step."""
         self.adam.update(self.gaussians.flat, gradient, self.rates(step))
 
     def rates(self, step: int) -> Float[Tensor, " p"]:
@@ -322,7 +325,7 @@ class Training(Brief):
         return learning_rates(self.gaussians, self.config.rates, position)
 
     def control_density(self, step: int, camera: Camera, base: LossAndGradient) -> None:
-        """Collect the screen-space gradient of a render; clone, split, prune and reset opacities in the steps that do so."""
+        """Collect the screen-space gradient of a render; clone, split, prune and reset opacities in the steps for it."""
         schedule, iterations = self.config.method.density_control(self.config), self.config.iterations
         if schedule.collects(step, iterations):
             self.screen_gradients.add(base.screen_gradient, base.splats, camera)
@@ -337,7 +340,7 @@ class Training(Brief):
             self.adam.forget("opacity_logits")
 
     def replace_gaussians(self, change: Densified) -> None:
-        """Go on with other Gaussians: Adam's moments follow each one that is kept and are 0 for new ones."""
+        """Continue with the Gaussians of a change; Adam's moments are kept with kept Gaussians, and 0 for new ones."""
         if not len(change.gaussians):
             raise InputError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
         self.gaussians = change.gaussians
@@ -347,10 +350,10 @@ class Training(Brief):
         self.method.on_densify(change)
 
     def update_filter(self, step: int, cameras: Sequence[Camera]) -> None:
-        """Give the Gaussians the 3-D filter of Mip-Splatting's training after a step, if that is how they are antialiased.
+        """Compute the 3-D filter of Mip-Splatting after a step, where the render settings have it.
 
-        As its published code does: at the start, whenever density control has changed the Gaussians, and after that every
-        FILTER_EVERY steps but the last ones.
+        As in its published code: at the start, whenever density control has changed the Gaussians, and after density control
+        every FILTER_EVERY steps, but not in the last FILTER_EVERY.
         """
         config = self.config
         if config.render.antialias != "mip-splatting":

@@ -1,8 +1,8 @@
-"""Projectors that leave out the directions in which a scene's loss is exactly flat (`null_space.py`).
+"""Orthogonal projectors P onto the complement of the directions in which a scene's loss is exactly flat (`null_space.py`).
 
-    Hessian         left out: the lengths of the quaternions, and SH directions that no view sees
-    Gauss-Newton    left out: all directions that no view sees
-    one attribute   of the Hessian's block of SH also those left out that couple SH to the mean alone
+    Hessian             P removes the lengths of the quaternions, and the SH directions that no view sees
+    Gauss-Newton        P removes all directions that no view sees
+    one attribute       of the Hessian's block of SH, P also removes the directions whose only curvature is with the mean
 
 In other units (`analysis/measures/units.py`) the operator is D P H P D, D = diag(scale), and the projector is the orthogonal
 one onto all D P x.
@@ -27,8 +27,8 @@ from splat.curvature.objective import SceneObjective
 class Projector:
     """An orthogonal projector P that acts on the parameters of each Gaussian separately.
 
-    blocks: rows of the attributes.  seen: what P keeps, of a Gaussian's SH where `radial` is given, else of all its parameters
-    in the order of the attributes.  radial: unit directions that P removes from the quaternions; all other geometry is kept.
+    blocks: rows of the attributes.  radial: None, or unit quaternions, which P removes; it keeps other geometry and opacity.
+    seen: range of P in a Gaussian's SH where `radial` is given, else in all its parameters, in the order of the attributes.
     """
 
     blocks: Mapping[str, slice]
@@ -37,7 +37,7 @@ class Projector:
 
     @property
     def rank(self) -> int:
-        """The dimension of what P keeps."""
+        """The dimension of the range of P."""
         geometry = 0 if self.radial is None else 10 * len(self.radial)  # mean 3, log-scales 3, quaternion 3, logit 1
         return geometry + int(self.seen.rank.sum())
 
@@ -56,7 +56,7 @@ class Projector:
     def without_lengths(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """V without its components along `radial`; V itself where there is none.
 
-        H P is H of that alone: along all else that P leaves out, H is zero.
+        H maps this and P V to the same: H is zero along all other directions that P removes.
         """
         if self.radial is None:
             return V
@@ -74,16 +74,16 @@ class Projector:
         return Projector(self.blocks, self.seen.scaled(parts["sh"]), radial)
 
 
-def projector_of(objective: SceneObjective, *, gauss_newton: bool = False, apart: bool = False) -> Projector:
-    """P of the Hessian, or of its Gauss-Newton part.  apart: of the Hessian's blocks of single attributes."""
+def projector_of(objective: SceneObjective, *, gauss_newton: bool = False, single: bool = False) -> Projector:
+    """P of the Hessian, or of its Gauss-Newton part.  single: of the Hessian's blocks of single attributes."""
     active = objective.active
     if gauss_newton:
         n, bands = active.sh.shape[:2]
         views = [view.jacobian for view in objective.linearized]
         return Projector(objective.blocks, seen_parameters(views, n, bands, objective.gather_rows))
     views = (view.jacobian for view in objective.linearized)
-    complete = objective.gather_rows, objective.mean_over_views
-    colours = seen_colours(views, len(objective.views), active, *complete, apart=apart)
+    gather = objective.gather_rows, objective.mean_over_views
+    colours = seen_colours(views, len(objective.views), active, *gather, slopes=not single)
     return Projector(objective.blocks, colours, active.quats)
 
 
@@ -92,20 +92,18 @@ def active_spaces(
 ) -> dict[str, ActiveSpace]:
     """Complements of the exact null space, of the whole operator and of each attribute's block, for `landscape.families`.
 
-    projector: of the whole operator (`SceneHessian.projector`).  scale: D > 0, 1 by default.  The blocks of Gauss-Newton are
-    given the spaces of the Hessian's; they may be flat along more.
+    projector: of the whole operator (`SceneHessian.projector`).  scale: diagonal of D > 0, 1 by default.  The blocks of
+    Gauss-Newton are given the spaces of the Hessian's blocks; they may be flat along more directions.
     """
-    apart = projector_of(objective, apart=True)
-    whole, each = (P if scale is None else P.scaled(scale) for P in (projector, apart))
-    ranks = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
-    ranks["quats"] -= len(objective.active)
-    ranks["sh"] = int(apart.seen.rank.sum())
+    blocks = projector_of(objective, single=True)
+    whole, each = (P if scale is None else P.scaled(scale) for P in (projector, blocks))
+    ranks = {**objective.block_dims, "sh": int(blocks.seen.rank.sum())}
     spaces = {name: ActiveSpace(_within(each, name), rank) for name, rank in ranks.items() if rank}
     return {WHOLE: ActiveSpace(whole.apply, projector.rank), **spaces}
 
 
 def _within(projector: Projector, name: str) -> Callable[[Tensor], Tensor]:
-    """A projector's action on one attribute's rows, none of which it mixes with others."""
+    """A projector's action on one attribute's rows; the projector must not mix attributes."""
     rows, count = projector.blocks[name], max(rows.stop for rows in projector.blocks.values())
 
     def within(V: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""Row space of the Hessian in the SH coefficients of each Gaussian, of which `null_space.py` has the formulas.
+"""Row space of the Hessian in the SH coefficients of each Gaussian; `null_space.py` has the formulas.
 
 It is spanned by the harmonics Y(d_m) of the views m, for each channel that m does not clamp, and by at most three slopes
-sum_m a_mc dY(d_m)/dmu_j, vectors over all channels.  Mostly the channels have the same harmonics, and share a basis of them.
+sum_m a_mc dY(d_m)/dmu_j, vectors over all channels.  Mostly no channel is clamped, and the three share a basis of harmonics.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,9 +18,9 @@ from splat.curvature.null.colour_space_cpu import project_colours
 from splat.curvature.null.row_space import (
     CHUNK,
     TOLERANCE,
+    Gather,
     RowSpace,
-    Stacked,
-    alone,
+    identity,
     joined,
     orthonormal,
     row_space,
@@ -34,7 +34,7 @@ from splat.projection.formulas import ProjectionJacobian
 class ColourSpace:
     """A space of SH coefficients for each Gaussian, laid out like `Gaussians.sh`: d = bands x 3 channels.
 
-    harmonics: spaces of the coefficients of one channel; row: index of each channel's space in it.  slopes: directions over all
+    harmonics: spaces of one channel's coefficients.  row: index of each channel's space in it.  slopes: directions over all
     channels, orthogonal to the harmonics.
     """
 
@@ -47,7 +47,7 @@ class ColourSpace:
         return self.harmonics.rank[self.row].sum(dim=1) + self.slopes.rank
 
     def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
-        """x without its null components."""
+        """Orthogonal projection of x onto the space."""
         return self._by_products(x) if by_triton(x) else self._by_kernel(x)
 
     def _by_kernel(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
@@ -91,40 +91,38 @@ def seen_colours(
     views: Iterable[ProjectionJacobian],
     count: int,
     gaussians: Gaussians,
-    stacked: Stacked = alone,
-    summed: Stacked = alone,
+    gather_rows: Gather = identity,
+    gather_sums: Gather = identity,
     *,
-    apart: bool = False,
+    slopes: bool = True,
 ) -> ColourSpace:
-    """The directions of each Gaussian's SH coefficients in which the Hessian can be non-zero; count: of these views.
+    """The directions of each Gaussian's SH coefficients in which the Hessian can be non-zero.
 
-    stacked, summed: turn rows of these views, and sums over them, into those of the views of all processes (sums up to a
-    factor).  apart: for the Hessian's block of SH alone, which has no slopes.
+    count: number of views.  gather_rows, gather_sums: map rows of these views, and sums over them, to those of the views of all
+    processes (sums up to a factor).  slopes: False for the Hessian's block of SH alone, which has none.
     """
     like, (n, bands) = gaussians.flat, gaussians.sh.shape[:2]
     rows = like.new_zeros(n, count, bands + 3)  # harmonics, and which channels are not clamped
-    slopes, sizes = like.new_zeros(n, 3, 3 * bands), like.new_zeros(n)
+    sums, sizes = like.new_zeros(n, 3, 3 * bands), like.new_zeros(n)  # slopes, and the sum of the norms of their terms
     for m, view in enumerate(views):
         index, visible = torch.as_tensor(view.index), torch.as_tensor(view.visible)
         harmonic, slope, bar = (torch.as_tensor(part) for part in (view.harmonic, view.slope, view.colour_bar))
         rows[index, m] = torch.cat([harmonic[:, :bands], visible], dim=1)
         terms = torch.einsum("ekj,ec->ejkc", slope[:, :bands], bar).flatten(2)
-        slopes.index_add_(0, index, terms)
+        sums.index_add_(0, index, terms)
         sizes.index_add_(0, index, terms.flatten(1).norm(dim=1))
-    rows, slopes, sizes = stacked(rows), summed(slopes)[:, : 0 if apart else 3], summed(sizes)
-
-    def part(start: int) -> ColourSpace:
-        some = slice(start, start + CHUNK)
-        found = _colours_of(rows[some].double(), slopes[some].double(), sizes[some].double(), TOLERANCE[like.dtype])
-        return found.to(like.dtype)
-
-    return _joined([part(start) for start in range(0, n, CHUNK)])
+    rows, sums, sizes = gather_rows(rows), gather_sums(sums)[:, : 3 if slopes else 0], gather_sums(sizes)
+    chunks, tolerance = zip(*(x.split(CHUNK) for x in (rows, sums, sizes)), strict=True), TOLERANCE[like.dtype]
+    return _joined([_colours_of(r.double(), s.double(), a.double(), tolerance).to(like.dtype) for r, s, a in chunks])
 
 
 def _colours_of(
     rows: Float[Tensor, "n m _"], slopes: Float[Tensor, "n s d"], sizes: Float[Tensor, " n"], tolerance: float
 ) -> ColourSpace:
-    """The spaces of some Gaussians: a harmonic one for channel 0, others where channels 1 and 2 differ from it, and slopes."""
+    """The spaces of some Gaussians.  rows: harmonics, and which channels are not clamped; sizes: see `spanned`.
+
+    Harmonic spaces: of channel 0 of every Gaussian, then of channels 1 and 2 of those where other views clamp them.
+    """
     (harmonics, visible), n = rows.split([rows.shape[2] - 3, 3], dim=2), len(rows)
     everyone = torch.arange(n, device=rows.device)
     row, weights, gaussian = everyone[:, None].repeat(1, 3), [visible[:, :, 0]], [everyone]
@@ -142,7 +140,7 @@ def _colours_of(
 
 
 def _joined(parts: Sequence[ColourSpace]) -> ColourSpace:
-    """The space of all Gaussians, from those of consecutive ones; indices of harmonics are shifted by those before."""
+    """The space of all Gaussians, from those of consecutive ones."""
     rows, before = [], 0
     for part in parts:
         rows.append(part.row + before)

@@ -1,4 +1,4 @@
-"""The projection onto what is seen of SH coefficients (`colour_space.py`), on the CPU: one pass over the Gaussians."""
+"""Projection of SH coefficients onto a `ColourSpace` on the CPU: one pass over the Gaussians."""
 
 import numpy as np
 
@@ -7,16 +7,17 @@ from splat.backend.cpu.jit import kernel
 
 @kernel
 def project_colours(start, stop, basis, rank, row, slopes, slope_rank, x, out):
-    """out = P x of Gaussians start..stop.
+    """Write P x of Gaussians start .. stop to out.
 
-    x, out (n, b, 3 k): coefficients, the k vectors of a channel side by side.  basis (m, r, b), rank (m): of the harmonics;
-    row (n, 3): which of them each channel has.  slopes (n, s, b, 3), slope_rank (n).  What is seen whole is copied bit for bit.
+    x, out (n, b, 3 k): coefficients of k vectors, those of a channel side by side.  basis (m, r, b), rank (m,): spaces of
+    harmonics; row (n, 3): the space of each channel.  slopes (n, s, b, 3), slope_rank (n,).  A channel whose space is complete
+    is copied bit for bit.
     """
     bands, width = x.shape[1], x.shape[2]
     vectors = width // 3
     along = np.empty(width, x.dtype)
     for i in range(start, stop):
-        same = row[i, 0] == row[i, 1] == row[i, 2]
+        same = row[i, 0] == row[i, 1] == row[i, 2]  # then one pass does the three channels
         for c in range(1 if same else 3):
             j = row[i, c]
             first, last = (0, width) if same else (c * vectors, (c + 1) * vectors)

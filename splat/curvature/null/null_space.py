@@ -1,22 +1,22 @@
-"""The directions in which a scene's loss is exactly flat, Gaussian by Gaussian, and the projector that leaves them out.
+"""Directions in which a scene's loss is exactly flat, Gaussian by Gaussian, and their complement, which the loss "sees".
 
 A Gaussian enters a view only through its splat of nine numbers, so over M views Gauss-Newton sees at most
 min(9 M, 10 + 3 min(M, k)) of its 11 + 3 k parameters (k SH coefficients a channel): with SH degree 3 and three views a third of
-the spectrum is zeros that say nothing.  The row space of all its projections' Jacobians, stacked, is what is left.
+the spectrum is structural zeros.  It sees the row space of the stacked Jacobians of the Gaussian's projections.
 
-The Hessian sees the whole geometry but, by choice (`SceneHessian`), the lengths of the quaternions.  It sees SH coefficients f
-through colours alone.  With d_m the direction from view m to the mean mu, Y the harmonics, a_mc the loss's derivative in the
+The Hessian sees all geometry; the lengths of the quaternions are excluded by choice (`SceneHessian`).  It sees SH coefficients
+f through colours alone.  With d_m the direction from view m to the mean mu, Y the harmonics, a_mc the loss's derivative in the
 colour, and x any parameter,
 
     colour_mc      = sum_k f_kc Y_k(d_m) + 1/2
     d2L / df_kc dx = sum_m Y_k(d_m) da_mc/dx + sum_m a_mc dY_k(d_m)/dx
 
 where a_mc = 0 if view m clamps channel c.  So it sees Y(d_m) of every view that draws the Gaussian and does not clamp the
-channel and, over the channels together, three slopes sum_m a_mc dY_k(d_m)/dmu_j.  They couple SH to the mean alone: the block
-of SH by itself is flat along what they have at right angles to the harmonics.
+channel and, over the channels together, three slopes sum_m a_mc dY_k(d_m)/dmu_j.  Slopes couple SH to the mean only: the block
+of SH is flat along their components orthogonal to the harmonics.
 
-Rows are scaled to unit length before a basis of them is found (`row_space.py`).  Slopes are compared with what they are sums
-of.  The Hessian's space of SH coefficients is in `colour_space.py`, Gauss-Newton's of all parameters here.
+Numerical ranks (`row_space.py`): rows are scaled to unit length; slopes, which can cancel, are compared with the sum of the
+norms of their terms.  The Hessian's space of SH coefficients is in `colour_space.py`, Gauss-Newton's of all parameters here.
 """
 
 from collections.abc import Sequence
@@ -25,42 +25,45 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, Stacked, alone, joined, row_space
+from splat.curvature.null.row_space import CHUNK, TOLERANCE, Gather, RowSpace, identity, joined, row_space
 from splat.projection.formulas import GEOMETRY, ProjectionJacobian
 
 
-def seen_parameters(views: Sequence[ProjectionJacobian], n: int, bands: int, stacked: Stacked = alone) -> RowSpace:
-    """The directions of a Gaussian's parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
+def seen_parameters(views: Sequence[ProjectionJacobian], n: int, bands: int, gather: Gather = identity) -> RowSpace:
+    """The directions of each of n Gaussians' parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees.
+
+    gather: maps rows of these views to those of the views of all processes.
+    """
     dtype = _like(views).dtype
     parts = [
-        row_space(stacked(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), TOLERANCE[dtype]).to(dtype)
+        row_space(gather(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), TOLERANCE[dtype]).to(dtype)
         for start in range(0, n, CHUNK)
     ]
     return joined(parts)
 
 
 def _like(views: Sequence[ProjectionJacobian]) -> Tensor:
-    """An empty tensor of the views' precision, on their device."""
+    """An empty tensor with the views' dtype and device."""
     return torch.as_tensor(views[0].jacobian[:0])
 
 
 def _jacobian_rows(views: Sequence[ProjectionJacobian], start: int, stop: int, bands: int) -> Float[Tensor, "n r d"]:
-    """The Jacobians of the splats of Gaussians start..stop in every view, stacked: nine rows a view, zero where unseen."""
+    """The stacked Jacobians of Gaussians start .. stop: nine rows a view, zero where it does not see them."""
     width = GEOMETRY + 1 + 3 * bands
     rows = _like(views).new_zeros(stop - start, 9 * len(views), width, dtype=torch.float64)
-    for m, held in enumerate(views):
-        index = torch.as_tensor(held.index)
+    for m, view in enumerate(views):
+        index = torch.as_tensor(view.index)
         here = (index >= start) & (index < stop)
         i, at = index[here] - start, 9 * m
-        geometry = torch.as_tensor(held.jacobian)[here].double()
-        harmonic = torch.as_tensor(held.harmonic)[here, :bands].double()
-        opacity = torch.as_tensor(held.opacity_slope)[here].double()
-        slope, visible = (torch.as_tensor(part)[here].double() for part in (held.colour_slope, held.visible))
+        geometry = torch.as_tensor(view.jacobian)[here].double()
+        harmonic = torch.as_tensor(view.harmonic)[here, :bands].double()
+        opacity = torch.as_tensor(view.opacity_slope)[here].double()
+        slope, visible = (torch.as_tensor(part)[here].double() for part in (view.colour_slope, view.visible))
         rows[i, at : at + 5, :GEOMETRY] = geometry
         rows[i, at + 5, GEOMETRY] = 1.0  # a logit counts as seen however flat the sigmoid is
         if opacity.shape[1]:
             rows[i, at + 5, :GEOMETRY] = opacity
-            rows[i, at + 5, GEOMETRY] = torch.as_tensor(held.logit_slope)[here].double()
+            rows[i, at + 5, GEOMETRY] = torch.as_tensor(view.logit_slope)[here].double()
         for c in range(3):
             first = GEOMETRY + 1 + c
             rows[i, at + 6 + c, :3] = visible[:, c, None] * slope[:, c]

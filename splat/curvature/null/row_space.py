@@ -1,7 +1,7 @@
-"""Spaces of a few directions for each of many Gaussians, and orthonormal bases of them.
+"""Row spaces of many small matrices, one for each Gaussian, by their orthonormal bases.
 
-A basis is found per Gaussian by a small singular value decomposition of its rows; directions whose singular value is beneath
-TOLERANCE of the largest are null.
+A basis is found by a singular value decomposition of the rows; directions with a singular value below TOLERANCE times the
+largest are null.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,31 +14,30 @@ from torch import Tensor
 
 from splat.backend.cpu.threads import over_batch
 
-TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
+TOLERANCE = {
+    torch.float32: 1e-5,
+    torch.float64: 1e-11,
+}  # bound of rounding errors, relative to the largest singular value
 CHUNK = 4096  # Gaussians at a time
-WIDEST = 32  # rows and columns of matrices that CUDA takes apart together; larger ones it takes one by one
+WIDEST = 32  # most rows and columns of matrices that CUDA decomposes in a batch; larger ones it takes one by one
 
 
 @dataclass(frozen=True, eq=False)
 class RowSpace:
-    """An orthonormal basis per Gaussian of what is seen, zero-padded; rank: how many of its rows are not padding."""
+    """An orthonormal basis (rows) for each Gaussian, zero-padded; rank: number of rows that are not padding."""
 
     basis: Float[Tensor, "n r d"]
     rank: Int[Tensor, " n"]
 
     @cached_property
-    def _partial(self) -> Int[Tensor, " m"]:
-        """The Gaussians that have null components: with low SH degrees or many views few have any."""
-        return torch.nonzero(self.rank < self.basis.shape[2])[:, 0]
-
-    @cached_property
-    def _basis(self) -> Float[Tensor, "m r d"]:
-        """The bases of these Gaussians."""
-        return self.basis if len(self._partial) == len(self.basis) else self.basis[self._partial]
+    def _incomplete(self) -> tuple[Int[Tensor, " m"], Float[Tensor, "m r d"]]:
+        """The Gaussians whose space is not everything, and their bases; with low SH degrees or many views they are few."""
+        index = torch.nonzero(self.rank < self.basis.shape[2])[:, 0]
+        return index, self.basis if len(index) == len(self.basis) else self.basis[index]
 
     def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
-        """x without its null components."""
-        basis, index = self._basis, self._partial
+        """Orthogonal projection of x onto the space."""
+        index, basis = self._incomplete
         if basis is self.basis:
             return basis.mT @ (basis @ x)
         return x.index_copy(0, index, basis.mT @ (basis @ x[index]))
@@ -52,23 +51,24 @@ class RowSpace:
 
 
 def orthonormal(rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSpace:
-    """The space of rows that are independent of each other, followed by padding."""
-    matrices = rows.mT.double().cpu()  # CUDA forms one Q after the other
+    """The space of linearly independent rows, `rank` of them, followed by padding."""
+    matrices = rows.mT.double().cpu()  # CUDA would form one Q after the other
     directions = torch.empty_like(matrices.mT, memory_format=torch.contiguous_format)
 
     def decompose(first: int, last: int) -> None:
         directions[first:last] = torch.linalg.qr(matrices[first:last]).Q.mT
 
     over_batch(len(rows), decompose, matrices.device)
-    held = torch.arange(rows.shape[1], device=rows.device) < rank[:, None]
-    return RowSpace(torch.where(held[:, :, None], directions.to(rows), 0.0), rank)
+    kept = torch.arange(rows.shape[1], device=rows.device) < rank[:, None]
+    return RowSpace(torch.where(kept[:, :, None], directions.to(rows), 0.0), rank)
 
 
-Stacked = Callable[[Tensor], Tensor]
+Gather = Callable[[Tensor], Tensor]
+"""Rows of this process's views -> rows of all views."""
 
 
-def alone(rows: Tensor) -> Tensor:
-    """Rows of all views, of a process that has all of them."""
+def identity(rows: Tensor) -> Tensor:
+    """`Gather` of a process that has all views."""
     return rows
 
 
@@ -80,12 +80,12 @@ def joined(parts: Sequence[RowSpace]) -> RowSpace:
 
 
 def row_space(rows: Float[Tensor, "n r d"], tolerance: float) -> RowSpace:
-    """An orthonormal basis of each Gaussian's rows, whatever their lengths."""
+    """The row space of each Gaussian's rows, scaled to unit length."""
     return spanned(rows / rows.norm(dim=2, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny), None, tolerance)
 
 
 def spanned(rows: Float[Tensor, "n r d"], sizes: Float[Tensor, " n"] | None, tolerance: float) -> RowSpace:
-    """The leading right singular vectors: of values above tolerance of sizes, by default of the largest."""
+    """The span of the right singular vectors with values above tolerance times sizes, by default the largest value."""
     values, basis = _singular(rows)
     kept = (values > tolerance * (values[:, :1] if sizes is None else sizes[:, None])) & (values > 0)
     rank = kept.sum(dim=1)
@@ -93,7 +93,7 @@ def spanned(rows: Float[Tensor, "n r d"], sizes: Float[Tensor, " n"] | None, tol
 
 
 def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m d"]]:
-    """Singular values, descending, and right singular vectors; of wide rows on the CPU."""
+    """Singular values, descending, and right singular vectors; computed on the CPU for wide rows."""
     home, (n, r, d) = rows.device, rows.shape
     if rows.is_cuda and d > WIDEST:
         rows = rows.cpu()
@@ -103,7 +103,7 @@ def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float
         for start in range(first, last, CHUNK):
             some = slice(start, min(start + CHUNK, last))
             part = rows[some]
-            if rows.is_cuda and r > d:  # there, faster of d rows, with the same values and right vectors
+            if rows.is_cuda and r > d:  # R has the same values and right vectors, and fewer rows: faster there
                 part = torch.linalg.qr(part, mode="r").R
             _, values[some], basis[some] = torch.linalg.svd(part, full_matrices=False)
 

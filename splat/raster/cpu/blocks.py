@@ -38,7 +38,7 @@ from splat.raster.cpu.tile import (
     store3,
     undo_row,
 )
-from splat.raster.formulas import BENDS, BLOCK_INDEX, BLOCK_SUMS, COLOUR, CROSS, DEGREE2, SPLAT, cross_terms, step_block
+from splat.raster.formulas import BLOCK_INDEX, BLOCK_SUMS, COLOUR, CROSS, D2Q, DEGREE2, SPLAT, cross_terms, step_block
 
 AHEAD = 4  # intersections between a prefetch and its use
 GRAD, CURVATURE, BLOCK = UNDO, UNDO + 3, UNDO + 6  # in a row of pixels: v_image, h
@@ -136,4 +136,4 @@ def reduce_blocks(start, stop, index, splat_start, sums, moments, second_order, 
                 blocks[e, p, q] = total[BLOCK_INDEX[p, q]]
                 if second_order:
                     for j in range(3):
-                        blocks[e, p, q] += BENDS[j, p, q] * moments[i, j]
+                        blocks[e, p, q] += D2Q[j, p, q] * moments[i, j]

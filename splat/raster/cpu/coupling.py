@@ -1,19 +1,25 @@
 """The part of every splat's diagonal block that SSIM's coupling of pixels adds, exactly.
 
-The second derivative of SSIM couples the pixels of a window g.  With S'' at the window's centre (`losses/formulas.py`), r the
-residual, y the target and c = 1/2,
+The second derivative of SSIM couples the pixels of a window g (a Gaussian, "blur").  In each channel, for a change d of the
+image, with S'' (3, 3) at the window's centre (`losses/formulas.py`), r the residual, y the target and c = 1/2,
 
-    v . l'' v = sum over centres of M . S'' M + pixelwise terms,      M = (blur(v), blur(2 r v), blur((y - c) v))
+    d . l'' d = sum over centres of M . S'' M + pixelwise terms,      M = (blur(d), blur(2 r d), blur((y - c) d))
 
-for each channel.  v is the image's change with one of SLOPES numbers of a splat: w for its colour in the channel, and D, D u,
-D v, D u^2, D u v, D v^2 for the coefficients Q0, QU, ... of q' (w and D: `footprints.py`).  M takes three blurs of each, of the
-factors f = 1, 2 r and y - c times v.  The blur is separable, and u depends on the column alone: D f, D f v, D f v^2 and w f are
-blurred down the columns first, and then along the rows, with u(x + t) = u(x) + t `along`,
+A splat changes a channel by the slopes d = D, D u, D v, D u^2, D u v, D v^2 in the coefficients Q0, QU, ... of q', and d = w in
+its colour (w and D: `footprints.py`; u, v: whitened offset).  Its block has M . S'' M' for every pair of these SLOPES.
+
+The blur is separable, and u depends on the column alone.  So D f, D f v, D f v^2 and w f, for the factors f = 1, 2 r and y - c,
+are blurred down the columns first, and then along the rows, where u(x + t) = u(x) + t `along` gives the slopes with u:
 
     blur(u F) = u B_0 + along B_1       blur(u^2 F) = u^2 B_0 + 2 u along B_1 + along^2 B_2       B_j = sum_t t^j g_t F(x + t)
 
-A splat's rows go through a ring; its columns count from the first window that reaches one of its pixels.  Sums leave single
-precision every FLUSH rows.
+A ring buffer holds the last RING rows of a splat's fields; their columns count from the first window that reaches one of its
+pixels.  Sums are moved to double precision every FLUSH rows.  Three tuples go through the functions:
+
+    footprints   (layout, begin, values): `Footprints`, and w and D of the accumulators from begin on (`find_footprints`)
+    planes       (image, target, seconds, index of the channel's first pixel): of `losses.cpu.loss.Coupling`
+    work         (ring, rows, corners, spans, moved, sums): ring buffer; a row blurred down the columns; first pixel (row,
+                 column) of each of the splat's tiles; its first and last column in each row; M of each slope; sums by lane
 """
 
 import numpy as np
@@ -28,24 +34,24 @@ from splat.raster.cpu.footprints import FOOTPRINT
 from splat.raster.cpu.tile import ALONG, PARAMS, alpha_terms, row_range
 
 FACTORS = 3  # f: 1, 2 r, y - c
-POWERS = 4  # fields of each factor that are blurred down the columns: D, D v, D v^2, w
+POWERS = 4  # fields of each factor: D, D v, D v^2, w
 FIELDS = FACTORS * POWERS
-SLOPES = 7  # numbers of a splat that move a channel, in the order of its block: six of geometry, one of colour
+SLOPES = 7  # of a channel in a splat's numbers, in the order of its block: six of geometry, one of colour
 PAIRS = SLOPES * (SLOPES + 1) // 2
-RING = 16  # rows, at least the window's
-EDGE = 16  # floats at either side of a row: at least a vector, and the window's reach
+RING = 16  # rows: a power of two, at least the window's 2 REACH + 1
+EDGE = 16  # floats of padding at either side of a row: at least a vector, and REACH
 FLUSH = 16  # rows
 MIDDLE, *TAPS = (float(tap) for tap in window(torch.float64)[REACH:])
 TAPS = tuple(TAPS)
+# taps of B_1 and B_2
 FIRST, SECOND = (tuple((k + 1) ** power * tap for k, tap in enumerate(TAPS)) for power in (1, 2))
 
 
 @kernel
-def coupled_blocks(counter, index, params, frame, size, footprints, begin, found, image, target, seconds, blocks):
-    """Add to the blocks (m, 9, 9) of the splats at index, which begins with the largest: threads then end at the same time.
+def coupled_blocks(counter, index, params, frame, size, footprints, image, target, seconds, blocks):
+    """Add sum M . S'' M' to the blocks (m, 9, 9) of the splats at index, largest first: threads then end at the same time.
 
-    size: height and width of the image.  footprints, found: of `find_footprints`, from accumulator begin on.  image, target,
-    seconds: of `Coupling`.
+    size: height and width of the image.
     """
     L = lanes(params)
     widest = FIELDS * (frame.stride + 2 * EDGE)
@@ -57,37 +63,33 @@ def coupled_blocks(counter, index, params, frame, size, footprints, begin, found
     turn = fetch_and_increment(counter)
     while turn < index.size:
         splat = index[turn]
-        y0, y1 = find_spans(params, splat, frame, size[1], footprints, begin, found, corners, spans, weights)
+        y0, y1 = find_spans(params, splat, frame, size[1], footprints, corners, spans, weights)
         if y0 <= y1:
             box = box_of_windows(spans, y0, y1, frame, size[1], L)
             for channel in range(3):
                 planes = (image, target, seconds, channel * frame.size)
                 work = (ring, rows, corners, spans, moved, sums)
-                sum_windows(
-                    params, splat, channel, box, frame, size, footprints, begin, found, planes, work, part, total
-                )
+                sum_windows(params, splat, channel, box, frame, size, footprints, planes, work, part, total)
                 add_to_block(total, channel, blocks[turn])
         turn = fetch_and_increment(counter)
 
 
 @formula
-def find_spans(params, splat, frame, width, footprints, begin, found, corners, spans, weights):
-    """First and last row in which a splat has weight; to spans the first and last column of each row.
-
-    corners: filled with row and column of the first pixel of each of its intersections' tiles.
-    """
+def find_spans(params, splat, frame, width, footprints, corners, spans, weights):
+    """First and last row in which a splat has weight; fills corners and spans (see `work`).  weights: space for a vector."""
     L = lanes(params)
-    first, last = footprints.splat_start[splat], footprints.splat_start[splat + 1]
+    layout, begin, values = footprints
+    first, last = layout.splat_start[splat], layout.splat_start[splat + 1]
     y0, y1, done = frame.size, np.int64(-1), np.int64(0)
     for a in range(first, last):
-        row, column = footprints.tiles[a] // frame.columns * TILE_ROWS, footprints.tiles[a] % frame.columns * L
+        row, column = layout.tiles[a] // frame.columns * TILE_ROWS, layout.tiles[a] % frame.columns * L
         corners[a - first, 0], corners[a - first, 1] = row, column
         for y in range(max(row, done), row + TILE_ROWS):
             spans[y, 0], spans[y, 1] = frame.stride, -1
         done = row + TILE_ROWS
-        top, bottom = row_range(footprints.rows[a])
+        top, bottom = row_range(layout.rows[a])
         for y in range(top, bottom):
-            store(weights, 0, load(found, (footprints.place[a] - footprints.place[begin] + y - top) * FOOTPRINT * L))
+            store(weights, 0, load(values, (layout.place[a] - layout.place[begin] + y - top) * FOOTPRINT * L))
             for x in range(min(L, width - column)):
                 if weights[x] > 0:
                     spans[row + y, 0], spans[row + y, 1] = min(spans[row + y, 0], column + x), column + x
@@ -106,7 +108,7 @@ def hull_of(spans, first, last):
 
 @formula
 def box_of_windows(spans, y0, y1, frame, width, L):
-    """First and last row of a splat, first column of its windows, and the number of vectors that hold their columns."""
+    """First and last row of a splat, first column of its windows, and the number of vectors that their columns take."""
     lo, hi = hull_of(spans, y0, y1)
     left = max(lo - REACH, 0)
     vectors = (min(hi + REACH, width - 1) - left) // L + 1
@@ -128,8 +130,8 @@ def add_to_block(total, channel, block):
 
 
 @formula
-def sum_windows(params, splat, channel, box, frame, size, footprints, begin, found, planes, work, part, total):
-    """Sum a channel's M . S'' M over all windows, for every pair of slopes, into total (PAIRS,)."""
+def sum_windows(params, splat, channel, box, frame, size, footprints, planes, work, part, total):
+    """Write the sum of a channel's M . S'' M' over all windows to total (PAIRS,).  box: of `box_of_windows`; part: space."""
     ring, _rows, _corners, spans, _moved, sums = work
     y0, y1, left, vectors = box
     L = lanes(params)
@@ -137,11 +139,11 @@ def sum_windows(params, splat, channel, box, frame, size, footprints, begin, fou
     sums[:], total[:] = 0, 0
     for y in range(y0 - 2 * REACH, y0):
         clear_row(ring, y, vectors, pitch, L)
-    behind, a = 0, footprints.splat_start[splat]
+    unflushed, a = 0, footprints[0].splat_start[splat]
     for ahead in range(y0, y1 + 2 * REACH + 1):
         clear_row(ring, ahead, vectors, pitch, L)
         if ahead <= y1:
-            a = fill_row(params, splat, channel, ahead, box, frame, size[1], footprints, a, begin, found, planes, work)
+            a = fill_row(params, splat, channel, ahead, box, frame, size[1], footprints, a, planes, work)
         row = ahead - REACH
         if row < 0 or row >= size[0]:
             continue
@@ -149,18 +151,19 @@ def sum_windows(params, splat, channel, box, frame, size, footprints, begin, fou
         if hi < 0:
             continue
         lo, hi = lo - left, hi - left
-        window = (max(lo - REACH, 0) // L * L, min((hi + REACH) // L, vectors - 1) * L)
-        blur_columns(work, row, lo // L * L, hi, window, pitch, L)
-        add_windows(params, splat, row, left, window, frame, planes, pitch, work)
-        behind += 1
-        if behind == FLUSH:
+        columns = (max(lo - REACH, 0) // L * L, min((hi + REACH) // L, vectors - 1) * L)
+        blur_columns(work, row, lo // L * L, hi, columns, pitch, L)
+        add_windows(params, splat, row, left, columns, frame, planes, pitch, work)
+        unflushed += 1
+        if unflushed == FLUSH:
             flush(sums, L, part, total)
-            behind = 0
+            unflushed = 0
     flush(sums, L, part, total)
 
 
 @formula
 def clear_row(ring, y, vectors, pitch, L):
+    """Write zeros to row y of every field."""
     base = slot(y) * FIELDS * pitch + EDGE
     for at in range(base, base + FIELDS * pitch, pitch):
         for x in range(at, at + vectors * L, L):
@@ -168,36 +171,37 @@ def clear_row(ring, y, vectors, pitch, L):
 
 
 @formula
-def fill_row(params, splat, channel, y, box, frame, image_width, footprints, a, begin, found, planes, work):
-    """Write row y of the fields to the ring; the next a.  a: an accumulator of the splat at or before this row of tiles."""
+def fill_row(params, splat, channel, y, box, frame, image_width, footprints, a, planes, work):
+    """Write row y of the fields to the ring; the splat's first accumulator in this row of tiles.  a: one at or before it."""
     ring, _rows, corners, spans, _moved, _sums = work
     _y0, _y1, left, vectors = box
+    layout, begin, values = footprints
     L = lanes(params)
     pitch, row = vectors * L + 2 * EDGE, y & -TILE_ROWS
     base = slot(y) * FIELDS * pitch + EDGE - left
-    first, last = footprints.splat_start[splat], footprints.splat_start[splat + 1]
+    first, last = layout.splat_start[splat], layout.splat_start[splat + 1]
     while corners[a - first, 0] < row:
         a += 1
     at = a
     while at < last and corners[at - first, 0] == row:
-        top, bottom = row_range(footprints.rows[at])
+        top, bottom = row_range(layout.rows[at])
         inside, x = y - row, corners[at - first, 1]
         if top <= inside < bottom and x <= spans[y, 1] and x + L > spans[y, 0]:
-            where = (footprints.place[at] - footprints.place[begin] + inside - top) * FOOTPRINT * L
-            fill_lanes(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, base + x, pitch)
+            where = (layout.place[at] - layout.place[begin] + inside - top) * FOOTPRINT * L
+            fill_lanes(params, splat, x, y, channel, frame, image_width, where, values, planes, ring, base + x, pitch)
         at += 1
     return a
 
 
 @formula
-def fill_lanes(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, to, pitch):
-    """Write the fields of the vector of pixels at x."""
+def fill_lanes(params, splat, x, y, channel, frame, image_width, where, values, planes, ring, to, pitch):
+    """Write the fields of the vector of pixels at (x, y) to the ring at `to`; its w and D are in values at `where`."""
     L = lanes(params)
     image, target, _seconds, top = planes
     _u, terms = alpha_terms(params, splat * PARAMS, x, y)
     v = terms[0]
     inside = iota(params) < broadcast(params, image_width - x)
-    w, D = select(inside, load(found, where), 0.0), select(inside, load(found, where + (1 + channel) * L), 0.0)
+    w, D = select(inside, load(values, where), 0.0), select(inside, load(values, where + (1 + channel) * L), 0.0)
     photo = load(target, top + y * frame.stride + x)
     residual = load(image, top + y * frame.stride + x) - photo
     put_powers(ring, to, pitch, w, D, v)
@@ -206,12 +210,13 @@ def fill_lanes(params, splat, x, y, channel, frame, image_width, where, found, p
 
 
 @formula
-def put_powers(ring, to, width, w, D, v):
+def put_powers(ring, to, pitch, w, D, v):
+    """Write the POWERS fields of a factor."""
     Dv = D * v
     store(ring, to, D)
-    store(ring, to + width, Dv)
-    store(ring, to + 2 * width, Dv * v)
-    store(ring, to + 3 * width, w)
+    store(ring, to + pitch, Dv)
+    store(ring, to + 2 * pitch, Dv * v)
+    store(ring, to + 3 * pitch, w)
 
 
 @formula
@@ -227,6 +232,7 @@ def dot5(x, taps):
 
 @formula
 def sums_around(array, at, step):
+    """F(x + t) + F(x - t) for t = 1 to 5."""
     return (
         load(array, at + step) + load(array, at - step),
         load(array, at + 2 * step) + load(array, at - 2 * step),
@@ -238,6 +244,7 @@ def sums_around(array, at, step):
 
 @formula
 def differences_around(array, at):
+    """F(x + t) - F(x - t) for t = 1 to 5."""
     return (
         load(array, at + 1) - load(array, at - 1),
         load(array, at + 2) - load(array, at - 2),
@@ -249,7 +256,7 @@ def differences_around(array, at):
 
 @formula
 def sums_over_rows(ring, at, row, step):
-    """For 1 to 5 rows' distance, the sum of the rows above and below."""
+    """F(y + t) + F(y - t) for t = 1 to 5, from the ring."""
     return (
         load(ring, at + slot(row + 1) * step) + load(ring, at + slot(row - 1) * step),
         load(ring, at + slot(row + 2) * step) + load(ring, at + slot(row - 2) * step),
@@ -260,10 +267,10 @@ def sums_over_rows(ring, at, row, step):
 
 
 @formula
-def blur_columns(work, row, lo, hi, window, pitch, L):
-    """Blur every field down the columns lo .. hi; 0 in the other columns of the windows and beside them."""
+def blur_columns(work, row, lo, hi, columns, pitch, L):
+    """Blur every field down the columns lo .. hi; 0 in the other columns that windows centred in `columns` reach."""
     ring, rows, _corners, _spans, _moved, _sums = work
-    step, (first, last) = FIELDS * pitch, window
+    step, (first, last) = FIELDS * pitch, columns
     for at in range(EDGE, EDGE + step, pitch):
         for x in range(first - max(L, 8), last + max(L, 8) + L, L):
             if lo <= x <= hi:
@@ -274,13 +281,13 @@ def blur_columns(work, row, lo, hi, window, pitch, L):
 
 
 @formula
-def add_windows(params, splat, row, left, window, frame, planes, pitch, work):
-    """Add the windows centred in a row to the sums."""
+def add_windows(params, splat, row, left, columns, frame, planes, pitch, work):
+    """Add M . S'' M' of the windows centred in a row, in these columns, to the sums."""
     _image, _target, seconds, top = planes
     _ring, rows, _corners, _spans, moved, sums = work
     L = lanes(params)
     along, size = broadcast(params, params[splat * PARAMS + ALONG]), 3 * frame.size
-    for x in range(window[0], window[1] + L, L):
+    for x in range(columns[0], columns[1] + L, L):
         u, _terms = alpha_terms(params, splat * PARAMS, left + x, row)
         for factor in range(FACTORS):
             blur_row(rows, POWERS * factor * pitch + EDGE + x, pitch, u, along, moved, SLOPES * factor * L)
@@ -294,7 +301,7 @@ def add_windows(params, splat, row, left, window, frame, planes, pitch, work):
 
 @formula
 def blur_row(rows, at, pitch, u, along, moved, to):
-    """Blur the slopes times one factor along a row, for the vector at `at`."""
+    """Blur along a row, for the vector at `at`: one component of M for each slope, to moved."""
     L = lanes(rows)
     F, s, d = load(rows, at), sums_around(rows, at, 1), differences_around(rows, at)
     B0, B1, B2 = F * MIDDLE + dot5(s, TAPS), along * dot5(d, FIRST), along * along * dot5(s, SECOND)
@@ -313,7 +320,7 @@ def blur_row(rows, at, pitch, u, along, moved, to):
 
 @formula
 def add_pairs(moved, second, sums, L):
-    """Add M . S'' M of every pair of slopes to the sums."""
+    """Add M . S'' M' of every pair of slopes to the sums."""
     j = 0
     for a in range(SLOPES):
         n0, n1, n2 = ssim_second_dot(
@@ -327,7 +334,7 @@ def add_pairs(moved, second, sums, L):
 
 @formula
 def flush(sums, L, part, total):
-    """Move the sums to total."""
+    """Add the sums over lanes to total, in double precision, and clear them."""
     for j in range(0, PAIRS, 4):
         at = j * L
         store_sums(part, j, (load(sums, at), load(sums, at + L), load(sums, at + 2 * L), load(sums, at + 3 * L)))

@@ -1,7 +1,7 @@
-"""The compositing of the splats of one view on the CPU: `raster.dispatch.Raster` by Numba kernels.
+"""Compositing of the splats of one view on the CPU: `raster.dispatch.Raster` by Numba kernels on NumPy views of tensors.
 
-Tensors are taken and given without a copy; inside, the kernels work on NumPy views of them.  Planes are padded to whole tiles
-of `lanes` x TILE_ROWS pixels.
+Planes are padded to whole tiles of `lanes` x TILE_ROWS pixels, lanes the numbers of a vector register.  An intersection is a
+splat in a tile.  Arrays of the kernels, such as `params` and the accumulators: `tile.py`.
 """
 
 from functools import cached_property
@@ -19,11 +19,11 @@ from splat.model.settings import RenderSettings
 from splat.raster.cpu import binning, blocks, compositing, coupling, footprints, packing, tangents, tile
 from splat.raster.formulas import SPLAT, thresholds_of
 
-FOOTPRINT_BYTES = 1 << 28  # of the splats whose footprints are kept at a time
+FOOTPRINT_BYTES = 1 << 28  # most memory for footprints of splats at a time
 
 
 class CpuRaster:
-    """`raster.dispatch.Raster` by Numba kernels, on NumPy views of tensors; lists: those of the rendering."""
+    """`raster.dispatch.Raster` on the CPU; lists: the splats of each tile; plane: size of a padded plane (rows, columns)."""
 
     def __init__(
         self,
@@ -58,12 +58,12 @@ class CpuRaster:
         return binning.bin_splats(self.splats.numpy(), depths.numpy(), drawn.numpy(), *size, self.thresholds)
 
     def pack(self) -> None:
-        """The splats as the passes over the pixels read them."""
+        """Fill `params`, the splats as the passes over the pixels read them."""
         arguments = (self.splats.numpy(), self.thresholds.least, self.thresholds.contour, self.params)
         over_range(len(self.splats), packing.pack_splats, *arguments)
 
     def forward(self) -> None:
-        """The image, and where its pixels stop."""
+        """Fill `pixels`: the image, and where its pixels stop."""
         over_tiles(compositing.forward, self.params, self.lists, self.frame, self.pixels)
 
     @property
@@ -83,11 +83,7 @@ class CpuRaster:
 
     @cached_property
     def reached(self) -> tuple[tile.Lists, np.ndarray]:
-        """`number_accumulators`, kept from the first pass that sums over pixels on."""
-        return self.number_accumulators()
-
-    def number_accumulators(self) -> tuple[tile.Lists, np.ndarray]:
-        """The intersections that some pixel reaches, and (n + 1,) where each splat's begin among the accumulators."""
+        """The intersections that some pixel reaches, and (n + 1,) the first accumulator of each splat."""
         stops = self._tiles(self.pixels.stop[None]).max(axis=(0, 2, 4)).reshape(-1)
         reached = np.minimum(np.diff(self.lists.start), stops).astype(np.int64)
         return binning.reached_lists(self.lists, reached, len(self.splats))
@@ -140,32 +136,38 @@ class CpuRaster:
         return torch.from_numpy(found)
 
     def coupled_blocks(self, loss: Coupling, index: Int[Tensor, " m"]) -> Float64[Tensor, "m 9 9"]:
-        """The part of the diagonal blocks of the splats at index (ascending) that the loss's coupling of pixels adds."""
+        """The part of the diagonal blocks of the splats at index (ascending) that the loss's coupling of pixels adds.
+
+        Footprints are kept for as many splats at a time as FOOTPRINT_BYTES allow, but for one at least.
+        """
         (lists, splat_start), splats = self.reached, index.numpy()
-        blocks = np.zeros((len(splats), SPLAT, SPLAT))
+        blocks, size = np.zeros((len(splats), SPLAT, SPLAT)), (self.height, self.width)
         layout, row = footprints.footprints_of(lists, splat_start), footprints.FOOTPRINT * lanes_of(self.dtype)
-        ends = layout.place[splat_start[splats + 1]]
-        together = max(FOOTPRINT_BYTES // (row * self.dtype.itemsize), 1)
-        done = 0
-        while done < len(splats):
-            first = splat_start[splats[done]]
-            stop = max(int(np.searchsorted(ends, layout.place[first] + together, side="right")), done + 1)
-            last = splat_start[splats[stop - 1] + 1]
-            found = aligned((int(layout.place[last] - layout.place[first]) * row,), self.dtype)
-            view, size = (self.params, lists, self.frame, self.pixels, layout), (self.height, self.width)
-            over_tiles(footprints.find_footprints, *view, first, last, found)
-            heaviest = done + np.argsort(np.diff(layout.place[splat_start])[splats[done:stop]])[::-1]
-            part = np.zeros((stop - done, SPLAT, SPLAT))
+        rows, ends = np.diff(layout.place[splat_start])[splats], layout.place[splat_start[splats + 1]]
+        most = max(FOOTPRINT_BYTES // (row * self.dtype.itemsize), 1)
+        start = 0
+        while start < len(splats):
+            begin = splat_start[splats[start]]
+            stop = max(int(np.searchsorted(ends, layout.place[begin] + most, side="right")), start + 1)
+            end = splat_start[splats[stop - 1] + 1]
+            values = aligned((int(layout.place[end] - layout.place[begin]) * row,), self.dtype)
+            view = (self.params, lists, self.frame, self.pixels)
+            over_tiles(footprints.find_footprints, *view, layout, begin, end, values)
+            heaviest = start + np.argsort(rows[start:stop])[::-1]
+            part = np.zeros((stop - start, SPLAT, SPLAT))
             over_tiles(
-                coupling.coupled_blocks, splats[heaviest], self.params, self.frame, size, layout, first, found, *loss[:3], part
+                coupling.coupled_blocks, splats[heaviest], self.params, self.frame, size, (layout, begin, values),
+                *loss[:3], part,
             )  # fmt: skip
             blocks[heaviest] = loss.weight * part
-            done = stop
+            start = stop
         return torch.from_numpy(blocks)
 
     def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Every intersection's splat, the number of pixels with weight of it, and the splat next in front of it among those of
-        its tile that have weight in one of these pixels (-1: none)."""
+        """Each intersection's splat; the number of pixels in which it has weight; the splat directly in front of it.
+
+        In front: of the tile's splats with weight in one of these pixels, the last one before it; -1 where there is none.
+        """
         lists = self.reached[0]
         covered, before = np.empty((2, lists.splat.size), np.int32)
         size = (self.width, self.height)
@@ -181,7 +183,7 @@ class CpuRaster:
 
 
 class CpuAdjoint:
-    """`raster.dispatch.Adjoint`: moments, and the cotangent that they are of."""
+    """`raster.dispatch.Adjoint` on the CPU."""
 
     def __init__(self, raster: CpuRaster, cotangent: Float[Tensor, "4 H W"]):
         lists, splat_start = raster.reached
@@ -199,7 +201,7 @@ class CpuAdjoint:
 
 
 class CpuTangent:
-    """`raster.dispatch.Tangent`: J u of K tangents, and what the second-order pass needs of it."""
+    """`raster.dispatch.Tangent` on the CPU; keeps the tangents of the final transmittances for `backward_tangent`."""
 
     def __init__(self, raster: CpuRaster, tangents_of_splats: Float[Tensor, "n k 9"]):
         self.raster, self._directions = raster, np.ascontiguousarray(tangents_of_splats.numpy(), raster.dtype)

@@ -1,8 +1,9 @@
-"""The compositing kernels of second order: `tangent` (J u), front to back, and `backward_tangent`, back to front.
+"""The compositing kernels for Hessian products: `tangent` (J u), front to back, and `backward_tangent`, back to front.
 
-Letters are those of `raster/formulas.py`: T, R, w, beta, r, tau, s, h; d.. marks a tangent, v_.. a cotangent.  K tangents share
-the primal quantities of a splat's rows, which stay in the first-level cache between them.  `.._single` is the code for K = 1,
-in one loop over the rows.
+Letters are those of `raster/formulas.py`: T, R, w, beta, r, tau, s, h; d.. marks a tangent, v_.. a cotangent.  `.._block`: K
+tangents share the primal quantities of a splat's rows, which stay in the first-level cache between them (`shared`).
+`.._single`: the same for K = 1, in one loop over the rows.  `state`: for each row of a tile the vectors that `tile.py` lists,
+those of a tangent K times.
 """
 
 import numpy as np
@@ -98,7 +99,7 @@ def end_tangent_row(state, b, L, frame, planes, transmittances, i, p):
 
 @formula
 def tangent_row(state, b, L, alpha, w, w_dq, colour, dcolour):
-    """Advance T' and image' of a row of pixels by one splat."""
+    """Advance T' and image' of a row of pixels by one splat.  w_dq: w q', 0 where the cap holds."""
     dT, dimage = step_tangent(load(state, b + DT * L), load3(state, b + DIMAGE * L, L), alpha, w, w_dq, colour, dcolour)
     store(state, b + DT * L, dT)
     store3(state, b + DIMAGE * L, L, dimage)
@@ -198,7 +199,7 @@ def begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_p
 
 @formula
 def backward_row(state, b, L, alpha, v_image, colour):
-    """Undo a splat in T and R of a row; w, beta and r R."""
+    """Undo a splat in T and R of a row; its w, beta and r R."""
     R = load(state, b + REST * L)
     before, rest, w, beta, r, _we = step_back(alpha, load(state, b + T * L), R, v_image, colour)
     store(state, b + T * L, before)
@@ -208,7 +209,7 @@ def backward_row(state, b, L, alpha, v_image, colour):
 
 @formula
 def backward_tangent_row(state, b, L, w, beta, rR, dq, v_image, colour, dcolour):
-    """Undo a splat in tau and R' of a row; s' where the cap does not hold, and h."""
+    """Undo a splat in tau and R' of a row; its s', which does not yet heed the cap, and h."""
     tau, dR, dv_image = load(state, b + TAU * L), load(state, b + DREST * L), load3(state, b + DGRAD * L, L)
     tau, dR, ds, h = step_backward_tangent(tau, dR, dv_image, w, beta, rR, dq, v_image, colour, dcolour)
     store(state, b + TAU * L, tau)

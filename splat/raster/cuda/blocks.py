@@ -107,6 +107,6 @@ def gaussian_blocks(
     index = torch.from_numpy(formulas.BLOCK_INDEX).to(total.device, non_blocking=True)
     blocks = torch.nn.functional.pad(total.double(), (0, 1))[:, index]
     if second_order:
-        bends = torch.from_numpy(formulas.BENDS).to(total.device, non_blocking=True)
-        blocks += torch.einsum("mj,jpq->mpq", moments[:, :3].double(), bends)
+        factors = torch.from_numpy(formulas.D2Q).to(total.device, non_blocking=True)
+        blocks += torch.einsum("mj,jpq->mpq", moments[:, :3].double(), factors)
     return blocks

@@ -1,7 +1,7 @@
 """Attribute-space probes of StableGS: steps in all five attributes at once, along the gradient or at random.
 
-    tau     of an attribute: sqrt(max(tr H, 0) / dim), `splat.curvature.traces.curvature_scale`; the trace of quats is that
-            on the unit quaternions, without their radial directions, since H_quats scales with 1 / |q|^2
+    tau     sqrt(max(tr H, 0) / dim) of an attribute's block, `splat.curvature.traces.curvature_scale`; for quats on the unit
+            sphere, without radial directions, since H_quats scales with 1 / |q|^2
     rho     c / (tau + eps), at most the attribute's cap                                                       Eq. (5)
     g       the gradient of the sampled view's loss
     v       the unit vector from that view's camera centre to the mean
@@ -11,13 +11,13 @@
     opacity logit + rho sign(g)                                                                                Eq. (12)
     sh      + w_l e, e ~ N(0, 1) for each coefficient and channel, w_l = rho (1 + l / l_max), rho if l_max = 0 Eq. (13)
 
-x is the Hamilton product, exp(omega) = (cos(|omega| / 2), sin(|omega| / 2) omega / |omega|), kappa the condition number of
-the splat in the sampled view, with its blur.  A Gaussian out of that view has no g and no kappa: its mean, quaternion and
-opacity stay.  Scales and SH of all Gaussians are probed, as Eqs. (11) and (13) have it, for renders of the probed copy from
-other poses.
+Quaternions are w x y z; x is the Hamilton product, exp(omega) = (cos(|omega| / 2), sin(|omega| / 2) omega / |omega|).  kappa is
+the condition number of the splat's covariance in the sampled view, with its blur.  A Gaussian out of that view has g = 0 and no
+kappa: its mean, quaternion and opacity stay.  Scales and SH of all Gaussians are probed, as in Eqs. (11) and (13), for renders
+of the probed copy from other poses.
 
-The step counts as a constant, as in SAM: with Theta' = Theta + step (Eq. (14)), dTheta' / dTheta is the identity, but for the
-quaternions the right multiplication by exp(omega), an orthogonal matrix.
+The step counts as a constant, as in SAM: with Theta' = Theta + step (Eq. (14)), dTheta' / dTheta is the identity, except for
+quaternions: there it is right multiplication by exp(omega), an orthogonal matrix.
 """
 
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ from splat.projection.reference import NEEDLE, Splats, condition, on_screen
 
 Attribute = Literal["means", "log_scales", "quats", "opacity_logits", "sh"]
 Cap = Annotated[float, Meta(gt=0)]
-DRAWN = ("quats", "log_scales", "sh")
+DRAWN = ("quats", "log_scales", "sh")  # attributes with random steps
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,11 @@ class Caps(Settings):
 
 @dataclass(frozen=True)
 class ProbeSettings(Settings):
-    """Settings of the probes; c and eps of Eq. (5), caps of rho, gamma of Eq. (8), kappa_full of Eq. (10).
+    """Settings of the probes: c and eps of Eq. (5), caps of rho, gamma of Eq. (8), kappa_full of Eq. (10).
 
-    dimension: what tau divides a trace by (`splat.curvature.traces.curvature_scale`); not "active", because rho would be larger
-    by the root of the number of Gaussians, and the caps alone would decide on any but a tiny scene.
-    gamma: 1 for steps of means along the viewing ray, 0.5 along the gradient itself.
+    attributes: those that are probed, if their c is above 0.  dimension: dim of tau (`splat.curvature.traces.curvature_scale`);
+    by default not "active", with which rho is larger by the root of the number of Gaussians, and at its cap in all but tiny
+    scenes.  gamma: 1 for steps of means along the viewing ray, 0.5 along the gradient itself.
     """
 
     attributes: tuple[Attribute, ...] = ("means", "log_scales", "quats", "opacity_logits", "sh")
@@ -92,13 +92,13 @@ class ProbeSettings(Settings):
 
     @property
     def on(self) -> tuple[Attribute, ...]:
-        """The attributes that are probed: those named whose c is above 0.  Only their traces are needed."""
+        """The attributes that are probed, whose traces are needed: those named with c above 0."""
         return tuple(name for name in self.attributes if getattr(self.c, name) > 0)
 
 
 @dataclass(frozen=True)
 class Magnitude(Typed):
-    """The step length rho of an attribute, and what it follows from: trace, tau, and rho of Eq. (5) before its cap."""
+    """The step length rho of an attribute, and how it is computed: trace, tau, and rho of Eq. (5) before its cap."""
 
     trace: Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
     tau: NonNegative
@@ -118,10 +118,10 @@ class Magnitude(Typed):
 def magnitudes(
     traces: Mapping[str, float], active: int, sh_degree: int, extent: float, settings: ProbeSettings = ProbeSettings()
 ) -> dict[str, Magnitude]:
-    """The magnitude of each attribute that is on.
+    """The magnitude of each probed attribute.
 
-    traces: of its Hessian block (quats: on the unit sphere) over `active` Gaussians; extent: of the scene, in world units, by
-    which the cap of the means is multiplied.  InputError where a trace is missing or not finite.
+    traces: of the attributes' Hessian blocks (quats: on the unit sphere) over `active` Gaussians.  extent: of the scene, world
+    units; the cap of the means is in units of it.  InputError where a trace is missing or not finite.
     """
     if active < 1 or not 0 < extent < inf:
         raise ValueError(f"expected at least 1 active Gaussian and a finite extent above 0, got {active} and {extent}")
@@ -146,7 +146,10 @@ class Probed:
     turns: Float[Tensor, "n 4"]
 
     def pull(self, gradient: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
-        """The gradient in the parameters from that in the probed ones, in its place: (q x e).p = q.(p x conjugate e)."""
+        """Pull a gradient in the probed parameters back to the original ones, in place.
+
+        For quaternions, with e = exp(omega): (q x e) . p = q . (p x conjugate(e)).
+        """
         pulled = self.gaussians.with_flat(gradient)
         pulled.quats.copy_(hamilton(pulled.quats, self.turns * self.turns.new_tensor([1, -1, -1, -1])))
         return gradient
@@ -162,12 +165,12 @@ def probe_attributes(
     settings: ProbeSettings,
     generator: torch.Generator,
 ) -> Probed:
-    """The Gaussians after a step of each attribute by its magnitude; attributes without one stay.
+    """The Gaussians after a step of each attribute by its magnitude; attributes without a magnitude stay.
 
-    gradient, splats: of the sampled view's loss and render.  Each random attribute has a generator of its own, seeded from
-    `generator` whether it is probed or not: no probe changes the draws of another, nor what `generator` gives next.
+    camera, gradient, splats: of the sampled view, its loss and its render.  Each attribute in DRAWN has a separate generator,
+    seeded from `generator` even where it is not probed: so no probe changes the draws of another or the state of `generator`.
     """
-    probed = gaussians.with_flat(torch.zeros_like(gaussians.flat))  # holds the step, until the Gaussians are added
+    probed = gaussians.with_flat(torch.zeros_like(gaussians.flat))  # the step, until the Gaussians are added
     step, slope = probed.attributes, gaussians.with_flat(gradient).attributes
     rho = {name: magnitude.rho for name, magnitude in magnitudes.items()}
     seeds = torch.randint(2**63 - 1, (len(DRAWN),), generator=generator).tolist()
@@ -195,7 +198,7 @@ def probe_attributes(
 
 
 def depth_biased(gradient: Float[Tensor, "n 3"], rays: Float64[Tensor, "n 3"], gamma: float) -> Float64[Tensor, "n 3"]:
-    """Unit vector along gamma g_depth + (1 - gamma) g_lateral, or 0; in float64, where the square of no float32 underflows."""
+    """Unit vector along gamma g_depth + (1 - gamma) g_lateral, or 0; in float64, where squares of float32 do not underflow."""
     v = _unit(rays)
     depth = (gradient * v).sum(dim=1, keepdim=True) * v
     return _unit(gamma * depth + (1 - gamma) * (gradient - depth))

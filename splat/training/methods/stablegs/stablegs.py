@@ -2,29 +2,28 @@
 
     L = L_recon(Theta) + asp_weight L_recon(Theta') + vsp_weight mean_k l(I_k(Theta), I_k(Theta'))      Eqs. (15), (21), (22)
 
-Theta' is one probed copy of all Gaussians in all attributes (`attribute_probe.py`), new at every step and constant to the
-derivative; k are probed viewpoints (`viewpoint_probe.py`), one for each training view or only for the sampled one; l is the
-loss of training, between two renders.  Of the gradient in Theta, what comes from an image of Theta' is pulled back through
-Eq. (14).  L_recon is the sampled view's, as Algorithm 1 has it.  There is no released code.
+Theta' is a probed copy of all Gaussians in all attributes (`attribute_probe.py`), new at every step.  The probe counts as
+constant: gradients in Theta' are pulled back to Theta through Eq. (14).  k are probed viewpoints (`viewpoint_probe.py`), one
+for each training view or only for the sampled one; l is the loss of training, between two renders.  L_recon is the loss of the
+sampled view, as in Algorithm 1.  There is no released code.
 
-Probing starts after `warm_up` steps.  Every `every` steps the magnitudes rho are computed anew from the traces of the
-Hessian's blocks over all training views, and with them the dominant occlusion edge of each view; both change slowly.  Density
-control sees the sampled view's gradient alone.  Where no training view sees a Gaussian, training goes on with the last
-magnitudes and edges, or none.  The history notes it, and counts the probed viewpoints that see none.
+Probing starts after `warm_up` steps.  A diagnosis every `every` steps computes the magnitudes rho from the traces of the
+Hessian's blocks over all training views, and the dominant occlusion edge of each view; both change slowly.  Density control
+uses the gradient of the sampled view only.  Where no training view sees a Gaussian, training continues with the last magnitudes
+and edges, or none.  The history notes this, and counts the probed viewpoints that see no Gaussian.
 
 Schedule.  The paper trains for 10,000 steps, 1,000 of them warm-up (Sec. 4, Algorithm 1).  Algorithm 1 densifies only after the
-warm-up (line 18), its text builds on 3DGS, which begins after step 500: `densify_after_warm_up` chooses.  In a training of
+warm-up (line 18), but the text builds on 3DGS, which begins after step 500: `densify_after_warm_up` chooses.  In a training of
 another length T, `StableGS.scaled` multiplies the warm-up and the first and last step of density control by T / 10,000, so that
-probing and densification overlap as they do in the paper; `landscape train` does so for all that is not set by hand.  The steps
-between two densifications and between resets of the opacities stay: they are the time in which Gaussians move and become
-opaque again, which does not depend on T.
+probing and densification overlap as in the paper; `landscape train` does so for settings that are not given.  The steps between
+two densifications and between resets of the opacities stay: in this time Gaussians move and become opaque again, whatever T.
 
-Accuracy.  tr H_b has an exact part and one that is sampled (`splat/curvature/traces.py`), with as many samples, from 8 to
-MOST_SAMPLES, as bring the 95% interval of rho within `accuracy` of it; rho takes the root of the trace.  A trace that almost
-cancels can miss that: its standard error is in the history.
+Accuracy.  tr H_b has an exact part and a sampled one (`splat/curvature/traces.py`).  The number of samples, from 8 to
+MOST_SAMPLES, is such that the 95% interval of rho is within `accuracy`; rho depends on the root of the trace.  A trace that
+almost cancels can miss the accuracy: its standard error is in the history.
 
-Left out because it cannot matter: the traces of attributes that are not probed; the probed copy where every rho is 0; each
-loss of weight 0; viewpoints that see nothing; the edges where nothing turns about them.
+Left out because it has no effect: the traces of attributes that are not probed; the probed copy where every rho is 0; each loss
+of weight 0; viewpoints that see nothing; the edges without edge rotation.
 """
 
 from collections.abc import Collection, Sequence
@@ -33,7 +32,6 @@ from math import inf
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Float
 from msgspec import Meta
 from torch import Tensor
 
@@ -64,16 +62,16 @@ from splat.training.methods.stablegs.viewpoint_probe import ViewpointSettings, c
 from splat.training.state import Method, MethodSettings, Step, TrainConfig, Training
 
 PAPERS_STEPS = 10_000
-MOST_SAMPLES = 64
+MOST_SAMPLES = 64  # of a trace
 
 
 @dataclass(frozen=True)
 class StableGS(MethodSettings):
-    """The paper's settings.
+    """Settings of StableGS; by default the paper's.
 
     warm_up: steps before probing starts; every: steps between two diagnoses (magnitudes and edges).
     asp_weight, vsp_weight: of the probed copy's loss, and of the agreement from probed viewpoints; 0 leaves it out.
-    traces: "exact" but for samples of the coupling between pixels, or "paper": Eq. (6)'s ten Gaussian samples a block.
+    traces: "exact": only the coupling between pixels is sampled; "paper": Eq. (6), ten Gaussian samples a block.
     accuracy: of rho with "exact" traces, relative, with 95% confidence; inf takes the fewest samples, four.
     viewpoints: "all" is the paper's K = M probes a step, "one" K = 1, that of the sampled view.
     densify_after_warm_up: Gaussians are cloned, split and removed only after the warm-up.
@@ -97,9 +95,8 @@ class StableGS(MethodSettings):
         return StableGSMethod(self, seed)
 
     def parts(self, config: TrainConfig) -> dict[str, int]:
-        """Without a probed attribute both losses compare the Gaussians with themselves."""
-        acts = self.probe.on and (self.asp_weight or self.vsp_weight)
-        return {"warm_up": self.warm_up} if acts else {}
+        # without a probed attribute both losses compare the Gaussians with themselves
+        return {"warm_up": self.warm_up} if self.probe.on and (self.asp_weight or self.vsp_weight) else {}
 
     def density_control(self, config: TrainConfig) -> DensifySettings:
         if not self.densify_after_warm_up:
@@ -119,14 +116,17 @@ class StableGS(MethodSettings):
 
 
 class RhoAccuracy(TraceSettings):
-    """Traces as accurate as rho has to be: relative, and no matter how far below 0, where rho is at its cap."""
+    """Settings of traces for rho: a trace is also accurate enough once its interval is below 0, where rho is at its cap."""
 
     def reached(self, value: float, low: float, high: float) -> bool:
         return high <= 0 or super().reached(value, low, high)
 
 
 class StableGSMethod(Method[StableGS]):
-    """magnitudes: of the attributes that are probed; normals: of each training view's edges, pixels, 0 where it has none."""
+    """Training with StableGS.
+
+    magnitudes: of the probed attributes, by name.  normals: (x, y) in pixels of each training view's edge, 0 where it has none.
+    """
 
     def __init__(self, settings: StableGS, seed: int):
         super().__init__(settings, seed)
@@ -136,7 +136,7 @@ class StableGSMethod(Method[StableGS]):
     def on_start(self, training: Training, views: Sequence[View]) -> None:
         if self.settings.vsp_weight:
             self.geometry = capture_geometry([view.camera for view in views])
-        if len(self.normals) not in (0, len(views)):  # restored
+        if len(self.normals) not in (0, len(views)):  # from a saved state
             raise InputError(
                 f"expected an edge's normal for each of {len(views)} training views, found {len(self.normals)} in the saved "
                 "training; take another copy of it, or train anew"
@@ -153,13 +153,13 @@ class StableGSMethod(Method[StableGS]):
             step.gaussians, base.gradient, step.camera, base.splats, self.magnitudes, settings.probe, self.generator
         )
         poses = self._poses(step)
-        # without magnitudes the probed copy is the original: its gradient is known, and both agree from everywhere
+        # without magnitudes the probed copy equals the original: same gradient, and no disagreement from any viewpoint
         if not self.magnitudes:
             return replace(base, gradient=(1 + settings.asp_weight) * base.gradient)
         total = base.gradient.clone()
         if settings.asp_weight:
-            again = step.loss_and_gradient(probed.gaussians)
-            total.add_(probed.pull(again.gradient), alpha=settings.asp_weight)
+            of_probed = step.loss_and_gradient(probed.gaussians)
+            total.add_(probed.pull(of_probed.gradient), alpha=settings.asp_weight)
         for pose in poses:
             if found := agreement_gradients(step, (step.gaussians, probed.gaussians), pose):
                 disagreement = found[0].add_(probed.pull(found[1]))
@@ -169,10 +169,10 @@ class StableGSMethod(Method[StableGS]):
         return replace(base, gradient=total)
 
     def _diagnose(self, step: Step) -> None:
-        """Magnitudes from the traces, and the edges."""
-        settings, config = self.settings, step.config
+        """Compute the magnitudes, which go to the history too, and the normals of the edges."""
+        settings = self.settings
         try:
-            objective = config.objective(step.gaussians, step.views)
+            objective = step.config.objective(step.gaussians, step.views)
         except NothingInSight:
             self.history.append({"step": step.number, "note": "no Gaussian in sight: magnitudes kept"})
             return
@@ -185,10 +185,11 @@ class StableGSMethod(Method[StableGS]):
             row["standard_error"] = estimates[name].standard_error
             self.history.append(row | {"capped": magnitude.capped, "negative": magnitude.negative})
         if settings.vsp_weight and settings.viewpoint.edge_rotation:
-            self.normals = [_edge_normal(step, view.camera) for view in step.views]
+            depths = (render_depth(step.gaussians, view.camera, step.config.render) for view in step.views)
+            self.normals = [dominant_edge(depth, alpha)[0] for depth, alpha in depths]
 
     def traces(self, objective: SceneObjective) -> dict[str, TraceEstimate]:
-        """Traces of the blocks of the attributes that are probed."""
+        """Traces of the Hessian's blocks of the probed attributes."""
         settings, names = self.settings, self.settings.probe.on
         if not names:
             return {}
@@ -200,7 +201,7 @@ class StableGSMethod(Method[StableGS]):
         return exact_traces(objective, self.generator, enough, names=names)
 
     def _count_unseen(self, step: Step) -> None:
-        """One more probed viewpoint that sees nothing, in a separate row after the last diagnosis."""
+        """Count a probed viewpoint that sees nothing, in a row of the history after the last diagnosis."""
         if not self.history or "count" not in self.history[-1]:
             note = "probed viewpoints without a Gaussian in sight, until the next diagnosis"
             self.history.append({"step": step.number, "note": note, "count": 0})
@@ -213,10 +214,9 @@ class StableGSMethod(Method[StableGS]):
             return []
         cameras = [view.camera for view in step.views]
         which = range(len(cameras)) if settings.viewpoints == "all" else [step.chosen]
-        still = torch.zeros(2)
         return [
             composite_pose(
-                cameras, m, self.normals[m] if self.normals else still, self.geometry, settings.viewpoint,
+                cameras, m, self.normals[m] if self.normals else torch.zeros(2), self.geometry, settings.viewpoint,
                 generator=self.generator,
             )
             for m in which
@@ -232,8 +232,3 @@ class StableGSMethod(Method[StableGS]):
         self.normals = typed(list[Tensor], state["normals"], "normals")
         if not all(normal.shape == (2,) for normal in self.normals):
             raise InputError("'normals': expected vectors of two numbers")
-
-
-def _edge_normal(step: Step, camera: Camera) -> Float[Tensor, "2"]:
-    with torch.no_grad():
-        return dominant_edge(*render_depth(step.gaussians, camera, step.config.render))[0]

@@ -1,22 +1,24 @@
 """Viewpoint-space probes of StableGS (Sec. 3.4, Eqs. (17)-(19)): one composite pose near each training view.
 
-R_m      world to camera      x_cam = R_m (x_world - t_m)      t_m      camera centre      e_z      the viewing direction
+R_m      rotation from world to camera, x_cam = R_m (x_world - t_m)
+t_m      camera centre, world units
+e_z      viewing direction in the camera's frame
 
 interpolation   n the nearest other training view, one t ~ U(t_min, t_max) for both:
                 R = Slerp(R_m, R_n, t) = R_m (R_m^T R_n)^t,   c = (1 - t) t_m + t t_n;   without it R = R_m, c = t_m
 parallax        c += delta p,   delta ~ N(0, (parallax_sigma r)^2), r the cameras' mean distance from their centroid;
                 p = R_m^T (cos phi, sin phi, 0), phi ~ U(0, 2 pi): perpendicular to the viewing direction R_m^T e_z
-                (the paper's `R e_z` reads R as camera to world)
-in a 360 capture the parallax is a spherical shell instead: c = target + orbit u, u ~ Uniform(S^2), R looks at the target,
-                level.  It replaces the interpolated pose, so that interpolation does nothing beside it.  The paper's
-                sphere is whole: about an object that is seen from above only, more than half of it lies below all cameras
+                (in the paper's `R e_z`, R is camera to world)
+shell           in a 360 capture, in place of interpolation and parallax: c = target + orbit u, u ~ Uniform(S^2), R looks at
+                the target, level.  As in the paper this is the whole sphere: where an object is seen from above only, more
+                than half of it lies below all cameras
 edge rotation   R <- exp(theta R R_m^T n) R,   theta ~ N(0, theta_sigma^2), n = (n_x, n_y, 0) the axis in view m's camera
-                frame, from its occlusion edges.  The same as R exp(theta R_m^T n): the paper's line, with n in the world
-axis            "normal": across the edges, the paper's; turning about it moves the image along them.  "tangent": along
-                the edges; turning about it moves the image across them.  A turn alone makes no parallax
+                frame, from its occlusion edges.  Equal to R exp(theta R_m^T n), the paper's formula with n in world axes
+axis            "normal" (the paper's): across the edges; a rotation about it moves the image along them.  "tangent": along
+                the edges; a rotation about it moves the image across them.  Rotation alone makes no parallax
 
-Randomness: every pose takes the same seven numbers from the generator, in the same order, whatever modes are on.  So a
-mode's draw does not change when another is switched, and an ablation compares like with like.
+Randomness: every pose takes the same seven numbers from the generator, in the same order, whatever modes are on.  So switching
+one mode does not change the draws of the others, and ablations differ in nothing else.
 """
 
 from collections.abc import Sequence
@@ -41,11 +43,11 @@ Position = Annotated[float, Meta(ge=-1, le=2)]
 class ViewpointSettings(Settings):
     """Modes and magnitudes of the probes.
 
-    edge_rotation, interpolation, parallax: whether each mode is on (in a 360 capture, parallax replaces interpolation).
-    capture: "forward" or "360" (the spherical shell in place of the parallax); "auto" tells by the cameras.
-    t_min, t_max: range of the interpolation, 0 the view, 1 its neighbour; below 0 and above 1 it extrapolates.
+    edge_rotation, interpolation, parallax: whether each mode is on (in a 360 capture, parallax switches the shell).
+    capture: "forward", "360" (with the shell), or "auto", decided by the cameras.
+    t_min, t_max: range of the interpolation: 0 the view, 1 its neighbour; it extrapolates below 0 and above 1.
     theta_sigma: of the edge rotation, degrees.  parallax_sigma: in units of the cameras' mean distance from their centroid.
-    axis: what the edge rotation turns about: the edges' normal or their tangent.
+    axis: of the edge rotation, the edges' normal or tangent.
     """
 
     edge_rotation: bool = True
@@ -75,9 +77,9 @@ def composite_pose(
     *,
     generator: torch.Generator,
 ) -> Camera:
-    """The probe of training view m: its intrinsics and size at the pose of Eqs. (17)-(19).
+    """The probe of training view m: a camera with its intrinsics and size, at the pose of Eqs. (17)-(19).
 
-    normal: of view m's edges, in its pixels, from `dominant_edge`; zero where it has none, and then nothing turns.
+    normal: of view m's edges, in its pixels, from `dominant_edge`; zero, for no edge rotation, where it has none.
     geometry: `capture_geometry(cameras)`.  A single camera has no neighbour and radius 0: only edge rotation moves it.
     InputError where a 360 capture is asked for but the cameras have no common target.
     """
@@ -106,14 +108,14 @@ def composite_pose(
 
 
 def nearest_camera(cameras: Sequence[Camera], m: int) -> int | None:
-    """The other camera whose optical axis is nearest to m's in angle; of parallel ones that whose centre is nearest.
+    """Index of the other camera with the smallest angle between its optical axis and m's; of equal ones, the nearest.
 
     None for a single camera.
     """
     axis, centre = cameras[m].forward, cameras[m].centre
 
     def distance(n: int) -> tuple[float, float]:
-        # the chord is accurate where the cosine is not; rounded, so that round-off does not decide between ties
+        # the chord is accurate where the cosine is not; rounded, so that ties are ties despite round-off
         return round(float((cameras[n].forward - axis).norm()), 9), float((cameras[n].centre - centre).norm())
 
     return min((n for n in range(len(cameras)) if n != m % len(cameras)), key=distance, default=None)
@@ -122,9 +124,9 @@ def nearest_camera(cameras: Sequence[Camera], m: int) -> int | None:
 def edge_axis(
     normal: Float[Tensor, "2"], camera: Camera, axis: Literal["normal", "tangent"] = "normal"
 ) -> Float[Tensor, "3"]:
-    """A pixel normal (or the tangent beside it) as a unit axis (x, y, 0) in the camera's frame; zero stays zero.
+    """Unit axis (x, y, 0) in the camera's frame of an edge's normal in pixels, or of its tangent; zero stays zero.
 
-    A gradient per pixel is one per unit of x / z after multiplication by the focal length.
+    A gradient per pixel, times the focal length, is a gradient per unit of x / z.
     """
     x, y = float(normal[0]) * camera.fx, float(normal[1]) * camera.fy
     lifted = (x, y, 0.0) if axis == "normal" else (-y, x, 0.0)

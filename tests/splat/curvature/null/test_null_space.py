@@ -132,13 +132,13 @@ def test_the_hessian_is_zero_along_the_harmonics_that_no_view_sees() -> None:
 @pytest.mark.parametrize("views", [1, 2, 3, 5, 8])
 def test_ranks_are_those_of_dense_hessians(views: int, sh_degree: int) -> None:
     objective = scattered(views, views, sh_degree, 7, LOSSES[views % 3], lightness=0.2)
-    operator, apart = SceneHessian(objective), projector_of(objective, apart=True)
+    operator, single = SceneHessian(objective), projector_of(objective, single=True)
     H = without_lengths(dense(SceneHessian(objective, keep_null=True)), objective)
     colours = objective.blocks["sh"]
     assert operator.rank == len(spectrum(H))
-    assert apart.rank == 10 * len(objective.active) + len(spectrum(H, colours))
+    assert single.rank == 10 * len(objective.active) + len(spectrum(H, colours))
     assert float((dense(operator) - H).norm()) < 1e-13 * float(H.norm())
-    projected = apart.apply(apart.apply(H).T)
+    projected = single.apply(single.apply(H).T)
     assert float((projected - H)[colours, colours].norm()) < 1e-13 * float(H[colours, colours].norm())
 
 
@@ -173,7 +173,7 @@ def test_a_view_does_not_see_gaussians_in_its_tiles_but_in_no_pixel() -> None:
     assert len(objective.active) == first.touched == 5
     assert 0 not in first.jacobian.index and 0 in second.jacobian.index
     H = dense(SceneHessian(objective, keep_null=True))
-    assert projector_of(objective, apart=True).rank == 10 * 5 + len(spectrum(H, objective.blocks["sh"]))
+    assert projector_of(objective, single=True).rank == 10 * 5 + len(spectrum(H, objective.blocks["sh"]))
 
 
 def test_the_rank_is_the_same_in_single_precision() -> None:
