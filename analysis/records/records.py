@@ -94,7 +94,7 @@ class Check(Struct, kw_only=True):
 
 
 class Skip(Struct, kw_only=True):
-    """Work left out as it changes no result.  seconds_saved: estimated from the time of the work done; None where not known."""
+    """Work that was not needed.  seconds_saved: estimated from the time of the work done; None where not known."""
 
     count: Count
     seconds_saved: Number
@@ -178,8 +178,9 @@ class Record(Generic[Data]):
 def record_folder(folder: str | Path, mark: str = ProbeRecord.FILE) -> Iterator[Path]:
     """A new, empty folder that becomes `folder` when the block ends, all at once; nothing changes if the block fails.
 
-    mark: the file that every record of this kind has; an old record at `folder` is replaced.  After a kill at any point, `folder`
-    is the old record, the new one, or (between two renames) absent with the old record complete in `.NAME.previous` beside it.
+    mark: the file that every record of this kind has; an old record at `folder` is replaced.  After a kill at any point,
+    `folder` is the old record, the new one, or (between two renames) absent, with the old one in `.NAME.previous` beside it,
+    which the next use restores.
     """
     folder = Path(folder).resolve()  # a link stays one
     require_replaceable(folder, mark)

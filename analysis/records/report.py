@@ -309,7 +309,7 @@ def data_uri(content: bytes, kind: str) -> str:
 def interactive_surface(record: Record[ProbeRecord]) -> dict[str, Any] | None:
     """Data and layout for plotly.js of the recorded slice as a surface, with the quadratic model where known; None without one.
 
-    Written here, as the import of plotly's Python package takes longer than the rest of the page.
+    Written without plotly's Python package, whose import is slow.
     """
     about = record.data.slice
     if about is None or "slice" not in record.arrays or not about.is_resolved:

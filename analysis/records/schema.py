@@ -124,8 +124,8 @@ class End(Struct, kw_only=True):
     """A Ritz value of an operator, signed, with its unit Ritz vector v.
 
     residual: |H v - value v|: an eigenvalue lies within this distance.  vector_error: about the sine of the angle between v and
-    the true eigenvector.  reason, note, views_error: as for `TraceOf`; the last of v . H v at this v, although another direction
-    may be steeper in the views left out.  without_one: least and largest v . H v with one of the views measured left out.
+    the true eigenvector.  reason, note: as for `TraceOf`.  views_error: likewise, of v . H v at this v; in the views left out
+    another direction may be steeper.  without_one: least and largest v . H v with one of the views measured left out.
     """
 
     value: Number
@@ -342,10 +342,10 @@ class Direction(Struct, kw_only=True):
 class Slice(Struct, kw_only=True):
     """The loss along a line or over a plane through the checkpoint.
 
-    cosine: of the angle between the two directions before they were orthogonalised.  center_loss: L at the centre, rendered with
-    the slice.  points, evaluated_points, crossed_points: of the grid, see ARRAYS; evaluations: renders of all views.
-    Errors are shares of the range of the evaluated losses.  tolerance: of the interpolated points; None where all are evaluated.
-    resolved: whether it was reached; else only evaluated points have a loss.  interpolation_error: bound at every interpolated
+    cosine: of the angle between the two directions before they were orthogonalised.  center_loss: L at the centre, rendered
+    with the slice.  points, evaluated_points, crossed_points: of the grid, see ARRAYS; evaluations: renders of all views.
+    Errors are shares of the range of the evaluated losses.  tolerance: asked of interpolated points; None where all are
+    evaluated.  resolved: whether it was reached; else only evaluated points have a loss.  interpolation_error: bound at every interpolated
     point (`landscape.slices.interpolation`); 0 where all are evaluated, None where there is no bound.  error_seen: the largest
     at `holdout_points` random points; share_beyond: with 95% confidence at most this share of the interpolated points has a
     larger error.  reason: as for `Trace`.
