@@ -139,6 +139,11 @@ class End(Struct, kw_only=True):
     def __post_init__(self) -> None:
         _require_error("residual", self.residual)
 
+    @property
+    def is_reached(self) -> bool:
+        """Whether the search for it did not end at a budget."""
+        return not (self.reason or "").endswith("budget")
+
 
 class Eigenvalue(End, kw_only=True):
     """Eigenvalue of the active operator.  matvecs: products H v of its search.  shares: of v's squared mass by attribute."""
@@ -345,10 +350,10 @@ class Slice(Struct, kw_only=True):
     cosine: of the angle between the two directions before they were orthogonalised.  center_loss: L at the centre, rendered
     with the slice.  points, evaluated_points, crossed_points: of the grid, see ARRAYS; evaluations: renders of all views.
     Errors are shares of the range of the evaluated losses.  tolerance: asked of interpolated points; None where all are
-    evaluated.  resolved: whether it was reached; else only evaluated points have a loss.  interpolation_error: bound at every interpolated
-    point (`landscape.slices.interpolation`); 0 where all are evaluated, None where there is no bound.  error_seen: the largest
-    at `holdout_points` random points; share_beyond: with 95% confidence at most this share of the interpolated points has a
-    larger error.  reason: as for `Trace`.
+    evaluated.  resolved: whether it was reached; else only evaluated points have a loss.  interpolation_error: bound at every
+    interpolated point (`landscape.slices.interpolation`); 0 where all are evaluated, None where there is no bound.
+    error_seen: the largest at `holdout_points` random points; share_beyond: with 95% confidence at most this share of the
+    interpolated points has a larger error.  reason: as for `Trace`.
     """
 
     directions: Annotated[list[Direction], Meta(min_length=1, max_length=2)]

@@ -93,7 +93,7 @@ def _end_rows(data: ProbeRecord) -> Iterator[Row]:
         value = measured(end.value, end.residual)
         about = f"{share:.0%} {attribute_name(main)}, {end.matvecs} products"
         about += f"{_reason(end.reason)}{_of_views(end.views_error)}"
-        if (end.reason or "").endswith("budget"):
+        if not end.is_reached:
             value, about = UNDETERMINED, f"at {value} so far; {about}"
         yield ENDS[name], value, about
 
@@ -277,7 +277,7 @@ def _line(row: Family, several: bool) -> FamilyLine:
 def _end(end: End, beyond: Number, outwards: int) -> Cell:
     """An end of the spectrum, or the bounds of one whose search ran out of its budget.  outwards: 1 of the largest, else -1."""
     value, residual, reason = end.value, end.residual, end.reason or ""
-    if not reason.endswith("budget") or value is None or residual is None:
+    if end.is_reached or value is None or residual is None:
         return Cell(measured(value, residual), "", reason)
     inner = quantity(value - outwards * residual)
     if beyond is None:
