@@ -78,7 +78,7 @@ class FamilyOptions:
     @property
     def expected(self) -> dict[str, tuple[int, float, float]]:
         """Expected work of every stage: units of its progress, products with a batch of vectors, and renders."""
-        scenes: dict[SceneName, float] = {"trained": 1.0} | ({"split": SPLIT} if self.split_control else {})
+        scenes: dict[SceneName, float] = {"trained": 1.0, "split": SPLIT} if self.split_control else {"trained": 1.0}
         return {
             _stage_of(scene, operator): (PARTS, PARTS * PRODUCTS * more, 0)
             for scene, more in scenes.items()

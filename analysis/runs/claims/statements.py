@@ -1,6 +1,6 @@
 """The paper's nine statements, each judged by the effects that decide it (`analysis.runs.claims.effects`).
 
-Sizes are the paper's, at 10,000 steps.  Of several effects the first decides, but where a statement says otherwise.
+Claimed sizes are the paper's, at 10,000 steps.  Of several effects the first decides, unless a docstring says otherwise.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -29,14 +29,14 @@ from analysis.runs.claims.effects import (
 
 ATTRIBUTES_ALONE, VIEWPOINTS_ALONE = "stablegs vsp_weight=0", "stablegs asp_weight=0"
 AXIS = ATTRIBUTES_ALONE + " probe.attributes={}"
-TIME = 1.45
-CLAIMED_VIEWS = 3  # of the gains in dB
-SUFFICIENT = 0.1  # relative standard error of a trace: rho, its root, is then known to 5%
+TIME = 1.45  # largest ratio of times that agrees with the paper's 1.3
+CLAIMED_VIEWS = 3  # training views of the claimed gains in dB
+SUFFICIENT = 0.1  # relative standard error of a trace, and so 5% of its square root rho
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """statement: the paper's, with its place.  finding: what was measured, in a sentence.  effects: the first decides."""
+    """The verdict on a statement.  source: its place in the paper.  finding: the measured effects in a sentence."""
 
     number: int
     statement: str
@@ -81,7 +81,7 @@ def depth(rows: pd.DataFrame) -> Judgement:
 
 
 def needles(rows: pd.DataFrame) -> Judgement:
-    """Judge by the curvature of both attributes; where no map has these, by the steepest eigenvector of the whole Hessian."""
+    """Decided by the curvature of both attributes; without a map, by the steepest eigenvector of the whole Hessian."""
     number = Interval.of(numbers(rows, "needle_count", BASE))
     null = number.value if number.n else 0.0
     blocks = {f"share of the curvature of {attribute_name(name)} on needles": f"needles_{name}" for name in STRETCHED}
@@ -144,7 +144,7 @@ def opacity(rows: pd.DataFrame) -> Judgement:
 
 
 def samples(rows: pd.DataFrame) -> Judgement:
-    """Ten samples suffice where the largest error that a trace can have is small, not where only the least is."""
+    """Holds where the upper bound of every trace's error is at most SUFFICIENT, not where a lower bound exceeds it."""
     words, columns = ("least", "largest"), ("hutchinson_{}", "hutchinson_{}_most")
     effects = [
         Effect(
@@ -217,7 +217,7 @@ def cost(rows: pd.DataFrame) -> Judgement:
 
 
 def _within(time: Interval) -> bool | None:
-    """Whether it is at most TIME, some ten percent more than the paper's 1.3; None: not decided."""
+    """Whether a ratio of times is at most TIME; None: not decided."""
     return None if time.n < LEAST or time.low <= TIME < time.high else time.high <= TIME
 
 
