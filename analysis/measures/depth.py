@@ -156,11 +156,11 @@ def depth_split(
     """Gradient and curvature of the active Gaussians' positions.  settings: as for `exact_traces`, for either trace."""
     rays = [rays_of(objective, index) for index in range(len(objective.views))]
     parts = (False, True) if objective.couples_pixels else (False,)  # the blocks whole, and pixel by pixel
-    components, own = [], torch.zeros(len(KINDS), len(parts), dtype=torch.float64)
+    components, sums = [], torch.zeros(len(KINDS), len(parts), dtype=torch.float64)
     for ray, view in zip(rays, objective.linearized, strict=True):
         components.append(along_and_across(view.gradient[objective.blocks["means"]].view(-1, 3), ray))
         for part, gauss_newton in enumerate(parts):
-            own[:, part] += _split_traces(
+            sums[:, part] += _split_traces(
                 view.block_diagonal(gauss_newton=gauss_newton, approximate=True).geometry[:, :3, :3], ray
             ).cpu()
     pairs = objective.gather_rows(torch.stack(components, dim=1)).flatten(0, 1)
@@ -169,7 +169,7 @@ def depth_split(
         SampledTrace(
             kind, dim, known, pixelwise[0] if pixelwise else None, settings, settings.min_probes, settings.max_probes
         )
-        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean_over_views(own).tolist(), strict=True)
+        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean_over_views(sums).tolist(), strict=True)
     ]
     found = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
     return DepthSplit(pairs[pairs.any(dim=1)], **found)

@@ -205,10 +205,10 @@ class Study:
         truth = self.scenes["float64"].gaussian_blocks() if dense is None else self.dense_blocks(dense)
         traces = self.traces("float64") if dense is None else self.dense_traces(truth)
         for precision in self.compared if dense is not None else ["float32"]:
-            own, sums = self.scenes[precision].gaussian_blocks(), self.traces(precision)
+            blocks, sums = self.scenes[precision].gaussian_blocks(), self.traces(precision)
             for i, (name, rows) in enumerate(self.blocks.items()):
                 K = cancels * condition("products", (rows, i + 1))
-                self.judge("own blocks", name, precision, own[name], truth[name], K)
+                self.judge("own blocks", name, precision, blocks[name], truth[name], K)
                 self.judge("traces", name, precision, sums[name], traces[name], sqrt(rows.stop - rows.start) * K)
 
     def traces(self, precision: str) -> dict[str, Tensor]:
