@@ -1,7 +1,7 @@
-"""Positions along and across the rays: how much of their gradient and curvature lies in depth, and what finite steps do.
+"""Derivatives of the positions along the rays (depth) and across them (lateral), and finite steps both ways.
 
 v_im is the unit vector from the centre of view m's camera to the mean of Gaussian i, as in Eq. (7); g_im and H_im are the
-gradient and the own 3 x 3 block of that view's loss in that mean.
+gradient and the 3 x 3 diagonal block of the Hessian of that view's loss in that mean.
 
               depth            lateral: two directions        summed over
     gradient  (g . v)^2        |g|^2 - (g . v)^2              pairs of a Gaussian and a view with g != 0
@@ -11,11 +11,11 @@ gradient and the own 3 x 3 block of that view's loss in that mean.
 The ratios are of depth to one lateral direction: of root mean square gradients, and of mean curvatures.  The paper's text on
 Eq. (4) says that the gradient's is "typically 100x" and that large eigenvalues follow.  But a mean that moves by d along its
 ray keeps its place in the image and changes the size s of its splat by s d / z; across the ray it moves the splat by f d / z.
-With splats that are small beside the focal length f, ratios far below 1 are to be expected.
+Where splats are small compared with the focal length f, the ratio is therefore far below 1.
 
-Derivatives do not see that Gaussians change their order: it is locally constant.  The rises do, as they are true renders.
-Steps d_i are along v or along a random direction across it, of random sign, and of the length that moves a splat by so many
-pixels where it is across: px |mean - centre| / f.
+Derivatives do not include changes of the Gaussians' order, which is locally constant; the rises do, as they are renders.  Steps
+d_i are along v or along a random lateral direction, of random sign and of length px |mean - centre| / f: a lateral step moves
+its splat by px pixels.
 """
 
 from collections.abc import Sequence
@@ -46,9 +46,10 @@ DRAWS = 3
 
 @dataclass(frozen=True, eq=False)
 class DepthSplit:
-    """components: |g . v| and |g - (g . v) v| of every pair of a Gaussian and a view with a gradient, per world unit.
+    """Gradient and curvature of the positions, split into depth and lateral.
 
-    depth, lateral: the traces of the positions' curvature along and across the rays.
+    components: |g . v| and |g - (g . v) v| of every pair of a Gaussian and a view with g != 0, per world unit.
+    depth, lateral: traces of the curvature.
     """
 
     components: Float64[Tensor, "pairs 2"]
@@ -68,7 +69,7 @@ class DepthSplit:
 
     @cached_property
     def curvature_ratio(self) -> Bracket:
-        """Ratio of the mean curvatures, with the intervals of both traces; undefined where the lateral one may be 0 or less."""
+        """Ratio of the mean curvatures with the bracket from both traces' intervals; undefined where lateral may be <= 0."""
         depth, lateral = self.depth, self.lateral
         if lateral.low <= 0:
             return Bracket(None, -inf, inf, "the lateral curvature is negative or its sign undetermined")
@@ -78,9 +79,9 @@ class DepthSplit:
 
 @dataclass(frozen=True, eq=False)
 class DepthRises:
-    """Rises of the loss by steps along and across the rays (columns: KINDS), rows by length.
+    """Rises of the loss: a row for each length of steps, a column for each of KINDS.
 
-    steps: px.  errors: standard errors of the means over draws.  discontinuous: the share of renders in which the order of the
+    steps: px.  errors: standard errors of the means over draws.  discontinuous: share of the renders in which the order of the
     splats, or the set of visible ones, differs from that at the start.
     """
 
@@ -96,7 +97,7 @@ class DepthRises:
         return depth / lateral, (depth / lateral).abs() * relative.square().sum(dim=1).sqrt()
 
     def rows(self) -> list[Rise]:
-        """Rises as a record has them; what is not finite is None."""
+        """Rows of the record, with None for numbers that are not finite."""
         columns: dict[str, Sequence[float]] = dict(zip(("ratio", "ratio_error"), (x.tolist() for x in self.ratios)))
         for kind, name in enumerate(KINDS):
             for suffix, table in (("", self.values), ("_error", self.errors), ("_crossed", self.discontinuous)):
@@ -155,11 +156,11 @@ def depth_split(
     """Gradient and curvature of the active Gaussians' positions.  settings: as for `exact_traces`, for either trace."""
     rays = [rays_of(objective, index) for index in range(len(objective.views))]
     parts = (False, True) if objective.couples_pixels else (False,)  # the blocks whole, and pixel by pixel
-    components, own = [], torch.zeros(len(KINDS), len(parts), dtype=torch.float64)
+    components, sums = [], torch.zeros(len(KINDS), len(parts), dtype=torch.float64)
     for ray, view in zip(rays, objective.linearized, strict=True):
         components.append(along_and_across(view.gradient[objective.blocks["means"]].view(-1, 3), ray))
         for part, gauss_newton in enumerate(parts):
-            own[:, part] += _split_traces(
+            sums[:, part] += _split_traces(
                 view.block_diagonal(gauss_newton=gauss_newton, approximate=True).geometry[:, :3, :3], ray
             ).cpu()
     pairs = objective.gather_rows(torch.stack(components, dim=1)).flatten(0, 1)
@@ -168,7 +169,7 @@ def depth_split(
         SampledTrace(
             kind, dim, known, pixelwise[0] if pixelwise else None, settings, settings.min_probes, settings.max_probes
         )
-        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean_over_views(own).tolist(), strict=True)
+        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean_over_views(sums).tolist(), strict=True)
     ]
     found = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
     return DepthSplit(pairs[pairs.any(dim=1)], **found)
@@ -181,7 +182,7 @@ def depth_rises(
     draws: int = DRAWS,
     progress: Progress | None = None,
 ) -> DepthRises:
-    """Rises of the loss by steps along and across the rays.  steps: px; draws: of all directions and signs, 2 or more."""
+    """Rises of the loss by steps along and across the rays.  steps: px; draws: of the directions and signs, 2 or more."""
     if draws < 2:
         raise InputError(f"expected at least 2 draws, got {draws}")
     seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
@@ -204,13 +205,13 @@ def depth_rises(
 
 
 def rays_of(objective: SceneObjective, index: int) -> Float[Tensor, "n 3"]:
-    """v of every active Gaussian in a view that this process holds."""
+    """v of every active Gaussian in the view with this index in `objective.views`."""
     means = objective.active.means
     return F.normalize(means - objective.views[index].camera.centre.to(means), dim=1)
 
 
 def along_and_across(vectors: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float64[Tensor, "n 2"]:
-    """The lengths of the parts of vectors along and across their rays.
+    """Lengths of the components of vectors along and across their rays.
 
     >>> along_and_across(torch.tensor([[3.0, -4.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]]))
     tensor([[4., 3.]], dtype=torch.float64)
@@ -224,7 +225,7 @@ def _across(vectors: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float[
 
 
 def _split_traces(blocks: Float[Tensor, "n 3 3"], rays: Float[Tensor, "n 3"]) -> Float64[Tensor, "2"]:
-    """Traces of both KINDS, summed."""
+    """Sums of v^T H v and of tr H - v^T H v."""
     H, v = blocks.double(), rays.double()
     depth = (v[:, None, :] @ H @ v[:, :, None]).sum()
     return torch.stack([depth, H.diagonal(dim1=1, dim2=2).sum() - depth])
@@ -237,7 +238,7 @@ def _signs(
     generators: Sequence[torch.Generator],
     names: Sequence[str],
 ) -> Float[Tensor, "p b s"]:
-    """Random signs along the rays, and random signs in space with what lies along the rays taken out (`traces.Draw`)."""
+    """Probe vectors: random signs along the rays; random signs in space, projected across the rays (`traces.Draw`)."""
     flat, ray = objective.active.flat, rays[index]
     U = flat.new_zeros(flat.numel(), len(names), len(generators))
     for j, generator in enumerate(generators):
@@ -251,7 +252,7 @@ def _signs(
 def _directions(
     objective: SceneObjective, index: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Steps along and across the rays, as long as a pixel is there."""
+    """Steps along and across the rays, of the length that is a pixel wide at the mean."""
     ray, camera, means = rays_of(objective, index), objective.views[index].camera, objective.active.means
     pixel = (means - camera.centre.to(means)).norm(dim=1, keepdim=True) / float(camera.fx)
     z = draw_probes(4 * len(ray), 1, generator, torch.float64, "gaussian").view(-1, 4).to(means)
@@ -259,7 +260,7 @@ def _directions(
 
 
 def _moved(objective: SceneObjective, index: int, moves: Float[Tensor, "n 3"]) -> tuple[float, object]:
-    """`evaluate_view` with the means moved."""
+    """`evaluate_view` with the means displaced by `moves`."""
     flat = objective.active.flat.clone()
     flat[objective.blocks["means"]] += moves.reshape(-1)
     gaussians = objective.active.with_flat(flat)

@@ -1,16 +1,14 @@
-"""The anisotropy families of a checkpoint: of all attributes together and of each, of the Hessian and of Gauss-Newton.
+"""Anisotropy of a checkpoint's curvature: of all attributes together and of each, of the Hessian and of Gauss-Newton.
 
-Curvature is compared in the units of a metric (`analysis.measures.units`): D H D.  The split control
-(`analysis.measures.split_control`) measures the same of the scene with every Gaussian split into two coincident halves.  Its
-images are nearly the same, so what an index changes by is what the number of Gaussians alone does to it.
+A family is both ends of the spectrum, the density and the indices (`landscape.spectrum.families`) of one of these:
 
-    scene       "trained": the checkpoint; "split": every Gaussian of it that a view sees, split in two
-    operator    "hessian", exact, or "gauss-newton"
+    scene       "trained": the checkpoint; "split": with every Gaussian in sight split into two coincident halves
+                (`analysis.measures.split_control`), which leaves the images nearly unchanged
+    operator    "hessian", exact, or "gauss-newton"; D H D in the units of a metric (`analysis.measures.units`)
     block       "all", or an attribute: that diagonal block of the operator
-    effect      an index of the split scene over that of the trained one, with what both brackets leave open
 
-Every family stops at its tolerance, its budget of products, or when its share of the time is spent.  The time left is divided
-among the families to come in proportion to their Gaussians.
+The effect of the split is an index of the split scene over that of the trained one: what the number of Gaussians alone changes.
+Every family stops at its tolerance, its budget of products, or its share of the time, in proportion to the scene's Gaussians.
 """
 
 from collections.abc import Callable, Mapping
@@ -50,9 +48,12 @@ SceneName = Literal["trained", "split"]
 OPERATORS: dict[schema.Operator, bool] = {"hessian": False, "gauss-newton": True}  # name -> gauss_newton
 PARTS = 6  # the whole and five attributes
 FEWEST_STEPS = 2  # that make a density
-TRACE_SAMPLES = 8  # of SSIM's coupling: to a few percent, within which start vectors do not know it
-PRODUCTS, SPLIT = 26.0, 1.5  # with a batch's vectors that a family takes; as much more where every Gaussian is split
-DENSITY_SHARE = 0.45  # of a family's time: 48 of 108 products by default
+TRACE_SAMPLES = 8  # of SSIM's coupling: to a few percent, less than the error from the density's start vectors
+PRODUCTS, SPLIT = (
+    26.0,
+    1.5,
+)  # expected products of a family, with a batch of vectors; factor of their cost in the split scene
+DENSITY_SHARE = 0.45  # of a family's time, as by default 48 of its 108 products
 
 
 @dataclass(frozen=True)
@@ -74,10 +75,20 @@ class FamilyOptions:
                 f"expected seconds and memory above 0 for the families, got {self.seconds} and {self.memory}"
             )
 
+    @property
+    def expected(self) -> dict[str, tuple[int, float, float]]:
+        """Expected work of every stage: units of its progress, products with a batch of vectors, and renders."""
+        scenes: dict[SceneName, float] = {"trained": 1.0, "split": SPLIT} if self.split_control else {"trained": 1.0}
+        return {
+            _stage_of(scene, operator): (PARTS, PARTS * PRODUCTS * more, 0)
+            for scene, more in scenes.items()
+            for operator in OPERATORS
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class FamilyRow:
-    """One family: its scene, operator and block.  dim: rows of the operator, with its null space (see `Family.rank`)."""
+    """One family.  dim: rows of the block, its null space included (see `Family.rank`)."""
 
     scene: SceneName
     operator: schema.Operator
@@ -109,7 +120,7 @@ class FamilyRow:
 
 @dataclass(frozen=True, eq=False)
 class FamilyFindings:
-    """unit: what the metric's units are, in words; control and effects: None and empty without the split control."""
+    """All families.  unit: the metric's, in words; control, effects: None and empty without the split control."""
 
     rows: tuple[FamilyRow, ...]
     control: SplitControl | None
@@ -119,7 +130,7 @@ class FamilyFindings:
     unit: str
 
     def added_to(self, record: ProbeRecord) -> ProbeRecord:
-        """The record of a probe with the families, what the split does to them, and what was left out."""
+        """The record of a probe with the families, the effects of the split, and notes on what was left out."""
         families, control = [row.record(self.metric, self.unit) for row in self.rows], UNSET
         if split := self.control:
             psnr = split.psnr if split.rms else None
@@ -152,7 +163,7 @@ def measure_families(
     """Every family of the scene and, if asked for, of the split scene.
 
     training: that of the checkpoint; stage: see `analysis.console.stages`; ends: of the objective's Hessian in the stored
-    parameters, where they have been looked for.
+    parameters, where known.
     """
     scenes: dict[SceneName, SceneObjective] = {"trained": objective}
     control, notes = None, []
@@ -181,18 +192,6 @@ def measure_families(
     return FamilyFindings(tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)), options.metric, unit)
 
 
-def expected_families(options: FamilyOptions) -> dict[str, tuple[int, float, float]]:
-    """Expected work of every stage: units of its progress, products of as many vectors as a batch has, and renders."""
-    scenes: dict[SceneName, float] = {"trained": 1.0}
-    if options.split_control:
-        scenes["split"] = SPLIT
-    return {
-        _stage_of(scene, operator): (PARTS, PARTS * PRODUCTS * more, 0)
-        for scene, more in scenes.items()
-        for operator in OPERATORS
-    }
-
-
 def _stage_of(scene: SceneName, operator: schema.Operator) -> str:
     return f"families: {operator}{', split' if scene == 'split' else ''}"
 
@@ -204,15 +203,16 @@ def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:
 
 
 class _Clock:
-    """Divides the time that is left among the families to come, in proportion to the Gaussians of their scene."""
+    """Divides the time left among the remaining families, in proportion to the Gaussians of their scene."""
 
     def __init__(self, seconds: float, gaussians: Mapping[SceneName, int]) -> None:
         self.end, self.gaussians = monotonic() + seconds, dict(gaussians)
-        self.to_come: dict[SceneName, int] = {name: PARTS * len(OPERATORS) for name in gaussians}
+        self.remaining: dict[SceneName, int] = {name: PARTS * len(OPERATORS) for name in gaussians}
 
     def share(self, scene: SceneName) -> float:
-        part = self.gaussians[scene] / sum(count * self.gaussians[name] for name, count in self.to_come.items())
-        self.to_come[scene] -= 1
+        """Seconds of the next family, which is one of this scene."""
+        part = self.gaussians[scene] / sum(count * self.gaussians[name] for name, count in self.remaining.items())
+        self.remaining[scene] -= 1
         return max(self.end - monotonic(), 0.0) * part
 
 
@@ -246,18 +246,21 @@ def _of_operator(
     report: Progress,
     notes: list[str],
 ) -> list[tuple[str, int, Family]]:
-    """(block, dim, family) of the whole and of every attribute of one operator.  ends: of the whole, where known."""
+    """(block, dim, family) of the whole and of every attribute of one operator.
+
+    ends: of the whole, where known.  seconds: the time of the next family.  notes: gets sentences on what was left out.
+    """
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
     spaces, found = active_spaces(hessian.objective, hessian.projector, scale), []
     traces = _traces(hessian, scale, spawn(generator))
-    each = _seconds_a_product(operator, options.family.batch, hessian.objective) if options.seconds < inf else 0.0
+    product = _seconds_a_product(operator, options.family.batch, hessian.objective) if options.seconds < inf else 0.0
     names = [WHOLE, *hessian.blocks]
     for done, name in enumerate(names):
         stream, allowed = spawn(generator), seconds()
-        if name != WHOLE and name not in spaces:  # an attribute without parameters, or wholly null
+        if name != WHOLE and name not in spaces:  # an attribute of rank 0
             continue
         report(done, len(names), name)
-        settings = _fitted(hessian.objective, options, allowed, each, notes)
+        settings = _fitted(hessian.objective, options, allowed, product, notes)
 
         def say(_: int, __: int, state: str, done: int = done) -> None:
             report(done, len(names), state)
@@ -278,20 +281,20 @@ def _traces(hessian: SceneHessian, scale: Tensor | None, generator: torch.Genera
 
 
 def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnds | None) -> Lead:
-    """Start vectors for a search: from an earlier one for the whole, else from the diagonal blocks of Gaussians.
+    """Start vectors of a search: the known ends of the whole, else eigenvectors of the diagonal blocks of Gaussians.
 
-    For both ends of the Hessian's whole and of rotations; for the largest alone of positions, whose least curvatures several
-    Gaussians make together, and of Gauss-Newton, whose smallest is 0.
+    For both ends of the Hessian and of its block of rotations.  For the largest end alone of positions, whose smallest one
+    spreads over several Gaussians, and of Gauss-Newton, whose smallest is 0.
     """
     if name not in (WHOLE, "means", "quats"):
         return Lead()
     if name == WHOLE and ends is not None:
         return Lead(torch.cat([ends.largest.vectors[:, :1], ends.smallest.vectors[:, :1]], dim=1))
     objective = hessian.objective
-    own, pixelwise = objective.approximate_blocks
+    blocks, pixelwise = objective.approximate_blocks
     if hessian.gauss_newton:
-        own = objective.pixelwise_blocks
-    known = BlockEigenvectors(objective, own, pixelwise, None if name == WHOLE else name, scale)
+        blocks = objective.pixelwise_blocks
+    known = BlockEigenvectors(objective, blocks, pixelwise, None if name == WHOLE else name, scale)
     if hessian.gauss_newton or name == "means":
         return Lead(known.steepest(1, 0))
     return Lead(known.warm_start())
@@ -307,9 +310,9 @@ def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: Scene
 
 
 def _fitted(
-    objective: SceneObjective, options: FamilyOptions, seconds: float, each: float, notes: list[str]
+    objective: SceneObjective, options: FamilyOptions, seconds: float, product: float, notes: list[str]
 ) -> FamilySettings:
-    """The budget, as far as time and memory allow it.  each: seconds of a product with as many vectors as a batch has."""
+    """The budget, as far as time and memory allow.  product: seconds of a product with a batch of vectors."""
     settings, eigen = options.family, options.family.eigen
     room = vectors_within(objective, options.memory)
     basis = basis_within(eigen, room)
@@ -318,15 +321,15 @@ def _fitted(
     batch = max(1, min(settings.batch, room // settings.steps))
     rounds = -(-settings.starts // batch)
     steps = settings.steps
-    if rounds * steps * each > DENSITY_SHARE * seconds:
-        steps = max(FEWEST_STEPS, int(DENSITY_SHARE * seconds / (rounds * each)))
+    if rounds * steps * product > DENSITY_SHARE * seconds:
+        steps = max(FEWEST_STEPS, int(DENSITY_SHARE * seconds / (rounds * product)))
         notes.append("some densities of the families took fewer steps than asked for, to stay within the time")
     eigen = replace(eigen, basis=basis, max_seconds=min(eigen.max_seconds, (1 - DENSITY_SHARE) * seconds))
     return replace(settings, eigen=eigen, batch=batch, steps=min(steps, settings.steps))
 
 
 def _effects(rows: list[FamilyRow]) -> tuple[schema.Effect, ...]:
-    """Index by index, the split scene's over the trained one's."""
+    """Every index of the split scene over that of the trained one."""
     split_rows = {(row.operator, row.block): row.family for row in rows if row.scene == "split"}
     effects = []
     for row in rows:
@@ -341,8 +344,9 @@ def _effects(rows: list[FamilyRow]) -> tuple[schema.Effect, ...]:
 
 
 def quotient(after: Bracket | None, before: Bracket | None) -> Bracket:
-    """after / before with all that their brackets leave open (90% where each holds with 95%); undetermined where either may be
-    zero or without bound.
+    """after / before with the bracket that both brackets imply; undetermined where either may be 0 or is unbounded.
+
+    Two brackets at 95% give one at 90%.
 
     >>> str(quotient(Bracket(6.0, 5.0, 8.0), Bracket(2.0, 2.0, 2.5)))
     '3 in [2, 4]'

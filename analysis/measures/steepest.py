@@ -37,7 +37,7 @@ LEAST, MOST = 0.05, 5  # share of the mass that makes a carrier; most carriers
 RISE, STEPS = (
     0.01,
     7,
-)  # share of the loss, at the longest step (at the shortest 2e-6: fifty times float32's rounding); steps
+)  # change of the loss by the longest step, as a share; steps (at the shortest 2e-6, well above round-off)
 AGREES = 0.2  # largest |factor - 1| that counts as agreement
 SIGMAS = 2.0  # standard deviations at which an outline is drawn
 ROOM, SMALLEST = 1.3, 8  # size of a crop: in outlines; at least 1 / SMALLEST of its view
@@ -52,7 +52,7 @@ Pictures = dict[str, UInt8[np.ndarray, "..."]]
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """An end of the spectrum: unit eigenvector and eigenvalue; title: such as "the steepest direction"."""
+    """An end of the spectrum: unit eigenvector and eigenvalue.  title: e.g. "the steepest direction"."""
 
     name: str
     title: str
@@ -63,12 +63,12 @@ class End:
 def steepest(
     objective: SceneObjective, end: End, values: Values, sights: Sequence[Sight], file: str
 ) -> tuple[Steepest, Pictures]:
-    """Carriers, steps and pictures of an eigenvector; pictures in bytes: view, photograph, minus, zero, plus, difference.
+    """Carriers, steps and pictures of an eigenvector.  Pictures in bytes: view, photograph, minus, zero, plus, difference.
 
     values, sights: from `scene_fields`.  file: name of the pictures' file, for the record.
     """
     mass = masses(end.vector, objective.active)
-    mass = mass / mass.sum()
+    mass, spread = mass / mass.sum(), participation(mass)
     order = mass.argsort(descending=True, stable=True)[:MOST].tolist()
     chosen = [i for i in order if mass[i] >= LEAST] or order[:1]
     view = objective.views[_view_with_most(sights, chosen[0])]
@@ -87,16 +87,16 @@ def steepest(
     }
     pictures, difference = _pictures(objective, view, places, crop)
     found = Steepest(
-        name=end.name, curvature=end.curvature, participation=participation(mass), carriers=carriers, view=view.name,
+        name=end.name, curvature=end.curvature, participation=spread, carriers=carriers, view=view.name,
         crop=list(crop), step=steps[best], losses=[pairs[best][0], loss, pairs[best][1]], difference=difference, file=file,
         steps=steps, factors=factors, rendered=rendered_sentence(end, loss, steps, factors),
-        sentence=sentence(end, carriers, participation(mass), view, len(objective.views)),
+        sentence=sentence(end, carriers, spread, view, len(objective.views)),
     )  # fmt: skip
     return found, pictures
 
 
 def heaviest_view(objective: SceneObjective, vector: Float[Tensor, " p"]) -> int:
-    """Place of the training view in which the Gaussian with most mass in a vector has most weight."""
+    """Index of the training view in which the Gaussian with most mass in a vector has most weight."""
     sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views]
     return _view_with_most(sights, int(masses(vector, objective.active).argmax()))
 
@@ -120,7 +120,7 @@ def _losses_at(
 
 
 def shown_step(factors: Sequence[float]) -> int:
-    """Index of the longest step whose factor is within AGREES of 1, else above 0, else of the longest; the longest come first.
+    """Index of the longest step whose factor is within AGREES of 1, else above 0, else 0.  Steps descend.
 
     >>> shown_step([0.5, 1.1, 0.9]), shown_step([-0.2, 0.5]), shown_step([-0.2, -1.0])
     (1, 1, 0)
@@ -130,7 +130,7 @@ def shown_step(factors: Sequence[float]) -> int:
 
 
 def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Sequence[float]) -> str:
-    """Sentence that compares renders with the curvature, at the step shown and over all steps, the longest first."""
+    """Sentence that compares renders with the curvature, at the step shown and over all steps, which descend."""
     best = shown_step(factors)
     step, factor, alone = steps[best], factors[best], end.curvature * steps[best] ** 2 / 2 / loss
     extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])} stored units"
@@ -235,9 +235,9 @@ def in_bytes(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "3 h w"]:
 
 
 def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, count: int) -> str:
-    """Sentence on the first carrier: its share of the vector, its shape, its place.  spread: participation; count: of views.
+    """Sentence on the first carrier: its share of the vector, shape and place.  The verb names its attribute of most mass.
 
-    The verb is that of the attribute with most of its mass.
+    spread: participation of the vector; count: number of views.
     """
     first = carriers[0]
     name = max(first.attributes, key=first.attributes.__getitem__)

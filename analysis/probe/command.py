@@ -1,7 +1,8 @@
-"""`landscape probe`: one checkpoint in, one record folder out (`analysis.records.records`), a summary, and where to look.
+"""`landscape probe`: from a checkpoint to a record folder (`analysis.records.records`) and a summary on the terminal.
 
-The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.  What finished
-stages found is kept in `.NAME.unfinished` beside the record, from which the same command continues, whatever ended this one.
+The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.  Results of
+finished stages are kept in `.NAME.unfinished` beside the record until it is complete: after any interruption the same command
+continues from them.
 """
 
 import shlex
@@ -13,7 +14,7 @@ from hashlib import file_digest
 from math import inf, isfinite
 from pathlib import Path
 from time import monotonic, perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rich.console import Console
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
     from analysis.measures.families import FamilyOptions
 
 CHECK_FAILED = 1
-DRAWING = 8.0  # seconds that a record and its pictures take, on two processors of 2023
+DRAWING = 8.0  # seconds of the time limit that are left for the record and its pictures
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
@@ -85,14 +86,14 @@ def _run(
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     say(_introduction(scene, checkpoint, objective), console=console)
-    after = _expected_after(family_options)
+    after = {} if family_options is None else family_options.expected
     say(_expected(objective, settings, after), console=console)
     pictures = digests(scene.select(checkpoint.scene.train))
-    told = (
+    identity = (  # what the results depend on: kept ones of another identity are not read
         f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {pictures} {settings} "
         f"{options.seed} {device} {versions()}"
     )
-    # a folder that is being written by another command, or cannot be, is noticed before anything is measured
+    # the folder is opened first, so that one that cannot be written is refused before anything is measured
     with (
         record_folder(out) if writes else nullcontext() as folder,
         stages,
@@ -101,7 +102,7 @@ def _run(
     ):
         generator = torch.Generator(device).manual_seed(options.seed)
         kept, views, deadline = None if ranks else unfinished, checkpoint.all_views, begun + limit - DRAWING
-        found = measure(objective, settings, generator, stages, kept, told, deadline, views, after)
+        found = measure(objective, settings, generator, stages, kept, identity, deadline, views, after)
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         data.steps = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
@@ -125,7 +126,7 @@ def _run(
 
 
 def _require_same_in_all_processes(limit: float, families: "FamilyOptions | None") -> None:
-    if isfinite(limit):  # no process's clock may decide what all measure
+    if isfinite(limit):  # the processes' clocks differ, and all must measure the same
         raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {limit:g}")
     if families is not None:
         raise InputError(
@@ -135,7 +136,7 @@ def _require_same_in_all_processes(limit: float, families: "FamilyOptions | None
 
 @contextmanager
 def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[None]:
-    """Tell how to go on after an interrupted probe."""
+    """Say how to continue, where the block is interrupted.  folder: of the stages that are kept."""
     try:
         yield
     except KeyboardInterrupt:
@@ -159,8 +160,8 @@ def _write(
     start: float,
     drawn: Draw | None,
 ) -> None:
-    """The record, its pictures and its page, into the folder."""
-    objective.release()  # processes that draw take memory too
+    """Write the record, its pictures and its page into the folder."""
+    objective.release()  # for the memory of the processes that draw
     write_views(folder, objective)
     write_with_pictures(folder, data, arrays, stages, start, drawn)
     from analysis.records.report import write_report
@@ -169,10 +170,16 @@ def _write(
 
 
 def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
-    """A checkpoint, our own or another tool's, and its scene.  out: beside which a picture explains a refusal."""
+    """A checkpoint, of this toolkit or of another, and its scene.  out: a refusal may leave a picture, OUT-mismatch.png."""
     listed = None if ask.train_list is None else read_names(ask.train_list)
-    foreign = replace(of_trainer(ask), scene=folder, views=ask.views, train_list=listed)
-    foreign = replace(foreign, images=ask.images, downscale=ask.downscale)
+    files = {
+        "scene": folder,
+        "views": ask.views,
+        "train_list": listed,
+        "images": ask.images,
+        "downscale": ask.downscale,
+    }
+    foreign = replace(of_trainer(ask), **files)
     checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
     scene = checkpoint.load_scene(path, folder)
     return checkpoint.thinned(scene, ask.max_views), scene
@@ -186,8 +193,10 @@ def scene_objective(
     keep_unseen: bool = False,
     loss: LossSettings | None = None,
 ) -> SceneObjective:
-    """A loss, by default the training's, over its views, at the checkpoint; ranks: share them.  keep_unseen: see
-    `SceneObjective`."""
+    """Objective at the checkpoint, over the training views, with the training's loss by default.
+
+    ranks: processes that share the views.  keep_unseen: see `SceneObjective`.
+    """
     ranks = ranks or ALONE
     training, names = checkpoint.training, ranks.share(checkpoint.scene.train, "training view")
     require_pictures(scene.select(names), training.gaussians)
@@ -200,26 +209,18 @@ def _settings(options: ProbeOptions) -> ProbeSettings:
     if options.seconds is not None and not options.seconds > 0:
         raise InputError(f"expected --seconds above 0, got {options.seconds:g}")
     settings = ProbeSettings.quick() if options.quick else ProbeSettings()
-    points = settings.slice_points if options.slice_points is None else options.slice_points
-    eigen = (
-        settings.eigen if options.end_products is None else replace(settings.eigen, max_matvecs=options.end_products)
-    )
-    density = settings.density_matvecs if options.density_products is None else options.density_products
-    return replace(
-        settings,
-        slice_points=points,
-        slice_rise=options.slice_rise,
-        eigen=eigen,
-        density_matvecs=density,
-        power_apart=options.power,
-    )
+    changes: dict[str, Any] = {"slice_points": options.slice_points, "density_matvecs": options.density_products}
+    if options.end_products is not None:
+        changes["eigen"] = replace(settings.eigen, max_matvecs=options.end_products)
+    changes = {name: value for name, value in changes.items() if value is not None}
+    return replace(settings, slice_rise=options.slice_rise, power_apart=options.power, **changes)
 
 
 def _family_options(options: ProbeOptions) -> "FamilyOptions | None":
-    """Options of the families, None where they are not asked for; the split control and a metric ask for them too."""
+    """Options of the families; None without --families, --split-control and --metric."""
     if not (options.families or options.split_control or options.metric != "parameters"):
         return None
-    from analysis.measures.families import FamilyOptions  # a fifth of a second of imports
+    from analysis.measures.families import FamilyOptions  # slow to import
 
     return FamilyOptions(options.metric, options.split_control, seconds=options.family_seconds)
 
@@ -234,24 +235,16 @@ def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjectiv
     )
 
 
-def _expected_after(families: "FamilyOptions | None") -> Expected:
-    if families is None:
-        return {}
-    from analysis.measures.families import expected_families
-
-    return expected_families(families)
-
-
 def _expected(objective: SceneObjective, settings: ProbeSettings, after: Expected) -> str:
-    """Time and memory, from a render and from the views' sizes.  MemoryError where it cannot fit."""
+    """Expected time and memory, from a render and from the views' sizes.  Raises MemoryError where it cannot fit."""
     peak = expected_peak(objective)
-    objective.loss(objective.active.flat)  # for the first render the kernels may compile
+    objective.loss(objective.active.flat)  # untimed, as the kernels may compile
     seconds = expected_seconds(settings, seconds_of_render(objective), after)
     return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
 
 
 def _conclude(data: ProbeRecord, out: Path, verbose: bool) -> None:
-    """The summary, or the table too; what failed or is not known, with what to do."""
+    """Print the summary (verbose: and the tables), what failed and what is not known, with remedies."""
     from analysis.records.report import FILE as REPORT
 
     console = Console()

@@ -6,16 +6,16 @@
                         is cheaper
     eigenvalues         the two largest and the smallest, from the start vectors of `splat.curvature.block_eigenvectors`
     slice               the loss over the plane of the first two eigenvectors: rendered where needed, interpolated elsewhere
-    density *           stochastic Lanczos quadrature, for sums and quantiles of |lambda|; its first runs hold the iterates of
-                        the paper's power iteration
-    power iteration     as a run of its own, if asked for
+    density *           stochastic Lanczos quadrature, for sums and quantiles of |lambda|; the Krylov spaces of its first runs
+                        contain the iterates of the paper's power iteration
+    power iteration     with separate products, only with --power
     finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
     depth *             the positions' gradient and curvature along the rays and across them, and finite steps both ways
     block shares        the share of H that lies within the diagonal blocks of Gaussians
 
-* not in a quick probe.  The first two stages call every kernel once: later ones compile nothing.  Estimators stop at their
-accuracy or at a limit on products, and their results say which; time matters only at a deadline.  Numbers depend on the seed
-alone, also where stages were kept from an earlier run.
+* not in a quick probe.  The first two stages call every kernel once, so that no later stage compiles one.  Estimators stop at
+their accuracy or at a limit on products; their results say which.  Time ends them only at a deadline.  Numbers depend on the
+seed alone, also those of stages kept from an earlier run.
 """
 
 from collections.abc import Sequence
@@ -67,13 +67,12 @@ from splat.curvature.scores.shares import BlockShare, block_shares
 from splat.curvature.traces import block_traces, exact_traces
 
 STAGES = ("traces", "eigenvalues", "slice", "density", "power iteration", "finite probe", "depth", "block shares")
-# notes on stages that were not asked for
-LEFT_OUT = {
+LEFT_OUT = {  # notes on stages that the settings exclude
     "density": "the spectral density was left out, and the indices that need it",
     "finite probe": "the finite probe was left out",
     "depth": "positions along and across the rays were left out",
 }
-MOST_SAMPLES = 64  # of a trace: summing the exact blocks takes less than more of them
+MOST_SAMPLES = 64  # of a trace on a CPU: more would take longer than summing the exact blocks
 
 
 def measure(
@@ -87,8 +86,11 @@ def measure(
     population: int | None = None,
     after: Expected = NOTHING,
 ) -> Measured:
-    """Run every stage.  folder, told, deadline: see `Kept`; population: the training's views, where the objective has fewer;
-    after: stages that the caller runs afterwards."""
+    """Run every stage.
+
+    folder, told, deadline: see `Kept`.  population: number of training views, where the objective has fewer.  after: stages
+    that the caller runs afterwards.
+    """
     with stages.stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
@@ -96,7 +98,7 @@ def measure(
         gradient = objective.gradient
         report(1, 1, f"{len(objective.views)} views")
         value = objective.loss(objective.active.flat)
-        objective.approximate_blocks  # noqa: B018 (computed here so that its kernels compile here)
+        objective.approximate_blocks  # noqa: B018 (cached; its kernels compile in this stage)
         if settings.block_coupling or not settings.trace_samples:
             _compile_blocks(objective)
     with stages.stage("checks") as report:
@@ -114,7 +116,7 @@ def measure(
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """The point of the loss that is measured, and what all stages share."""
+    """A point of the loss, and the quantities that all stages use."""
 
     objective: SceneObjective
     hessian: SceneHessian
@@ -134,12 +136,12 @@ def _all_stages(
 ) -> Measured:
     objective, settings = at.objective, at.settings
     traces = kept.run("traces", dict[str, TraceEstimate], lambda g, report, _: _traces(at, kept.left, g, report), True)
-    ends = kept.run("eigenvalues", EigenEnds, lambda *told: _ends(at, kept.left, *told), True)
+    ends = kept.run("eigenvalues", EigenEnds, lambda *given: _ends(at, kept.left, *given), True)
     assert traces is not None and ends is not None  # partial stages always return something
-    plane = kept.run("slice", PlaneSlice | None, lambda *told: _plane(at, ends, *told))  # pyright: ignore[reportArgumentType]
+    plane = kept.run("slice", PlaneSlice | None, lambda *given: _plane(at, ends, *given))  # pyright: ignore[reportArgumentType]
     spectrum = power = finite = depth = None
     if settings.density_matvecs:
-        spectrum = kept.run("density", Spectrum, lambda *told: _spectrum(at, ends, traces, *told))
+        spectrum = kept.run("density", Spectrum, lambda *given: _spectrum(at, ends, traces, *given))
     if settings.power_apart:
         power = kept.run(
             "power iteration", EigenEnds, lambda g, report, _: power_ends(at.operator, g, settings.power, report)
@@ -184,14 +186,14 @@ def _left_out(at: _Point, ends: EigenEnds, population: int) -> LeftOut:
 
 
 def _compile_blocks(objective: SceneObjective) -> None:
-    """Compile the kernel of exact blocks on one Gaussian: later, it would belie the expected time of the stages that use it."""
+    """Compile the kernel of exact blocks, on one Gaussian, so that the stages that use it take the expected time."""
     if objective.couples_pixels and not by_triton(objective.active.flat):
         one = objective.active.select(torch.zeros(1, dtype=torch.int64))
         objective.linearizer(one)(0).block_diagonals(approximate=False, parts=(False, True))
 
 
 def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Progress) -> dict[str, TraceEstimate]:
-    """Traces at their accuracy; on a CPU those that MOST_SAMPLES samples do not suffice for are summed over exact blocks."""
+    """Traces at their accuracy; on a CPU, those that need more than MOST_SAMPLES samples are summed over exact blocks."""
     allowed, samples = replace(at.settings.traces, max_seconds=seconds), at.settings.trace_samples
     if samples or by_triton(at.objective.active.flat):
         return exact_traces(at.objective, generator, allowed, report, samples=samples)
@@ -203,7 +205,7 @@ def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Prog
 
 
 def _ends(at: _Point, seconds: float, generator: torch.Generator, report: Progress, notes: list[str]) -> EigenEnds:
-    """Both ends of the spectrum, within the time left and with the largest basis that fits into memory."""
+    """Both ends of the spectrum, within `seconds` and with the largest basis that fits into memory."""
     eigen, memory = at.settings.eigen, at.settings.memory
     basis = basis_within(eigen, vectors_within(at.objective, memory))
     if basis < eigen.basis:
@@ -224,7 +226,7 @@ def _spectrum(
     report: Progress,
     notes: list[str],
 ) -> Spectrum:
-    """The density from Lanczos runs as long as fit into memory."""
+    """The density, from Lanczos runs of at most the length that fits into memory."""
     settings, iterates = at.settings, []
     room = vectors_within(at.objective, settings.memory)
     batch = MOST_AT_ONCE if room > FEWEST_STEPS * MOST_AT_ONCE else 1
@@ -272,5 +274,5 @@ def _plane(
 
 
 def evaluation(objective: SceneObjective, workers: int) -> Loss:
-    """The objective as a function to call from so many threads; from one alone, its kernels use all processors."""
+    """The objective as a function for this number of threads; called from one alone, its kernels use all processors."""
     return objective.evaluate if workers == 1 else single_threaded()(objective.evaluate)

@@ -1,4 +1,4 @@
-"""Record (`analysis.records.records.ProbeRecord`) and arrays of a probe's results."""
+"""The record (`analysis.records.records.ProbeRecord`) and the arrays of a probe's results."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 def probe_record(
     found: Measured, objective: SceneObjective, made: Provenance, timing: Mapping[str, float]
 ) -> ProbeRecord:
-    """All numbers that are no arrays, without the families.  timing: seconds of the stages so far."""
+    """The record without the families.  timing: seconds of the stages so far."""
     density, left_out = found.density, found.left_out
     of_loss = UNSET if left_out is None else sampling_error(left_out.losses, left_out.population)
     return ProbeRecord(
@@ -96,7 +96,7 @@ def grid_arrays(grid: Grid) -> dict[str, np.ndarray]:
 def provenance_of(
     seed: int, path: Path, command: Sequence[str], settings: Any, checkpoint: Checkpoint, scene: Scene
 ) -> Provenance:
-    """Provenance of a probe or a slice.  path: of the checkpoint; settings: a dataclass; command: as typed."""
+    """Provenance of a record.  path: of the checkpoint; settings: a dataclass; command: as typed."""
     return provenance(
         seed,
         lanes=lanes_of(np.float32),
@@ -133,7 +133,7 @@ def loss_name(loss: LossSettings) -> str:
 
 
 def left_out_note(views: int, population: int | None) -> list[str]:
-    """Note on the effect of views left out, where it is known and where not."""
+    """Note on the standard errors due to views left out; population: number of training views, None where all are measured."""
     if population is None:
         return []
     return [
@@ -204,7 +204,7 @@ def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalu
 
 
 def without_one(curvatures: Float64[Tensor, " m"]) -> tuple[float, float] | UnsetType:
-    """The least and the largest mean of all but one; UNSET of a single one."""
+    """The least and the largest mean without one of the values; UNSET of a single value."""
     m = len(curvatures)
     if m < 2:
         return UNSET
@@ -224,9 +224,9 @@ def _anisotropy(found: Measured) -> schema.Anisotropy:
 
 
 def literal_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
-    """The paper's index from its power iteration, where that arrived within the certain bracket; else that of the ends.
+    """The paper's index: of its power iteration where that converged, else of the ends; with the bracket of the ends.
 
-    Everything lies within a bracket without bound: there it has arrived where it stopped by itself.
+    It has converged where it lies in the bracket.  An unbounded bracket excludes nothing: there it must not end at a budget.
     """
     certain, paper, method = literal(ends), literal(power), ends.method.capitalize()
     value, note = paper.value, f"by power iteration, as the paper takes it; the bracket is that of {method}"
@@ -261,7 +261,7 @@ def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
 
 
 def counts_of(active: ActiveCounts, views_of: int | None, **work: int) -> Counts:
-    """views_of: None where no views were left out; work: the other fields of `Counts`."""
+    """Counts of a record.  views_of: None where no views were left out; work: the other fields of `Counts`."""
     return Counts(
         gaussians=active.gaussians,
         visible_gaussians=active.active_gaussians,
@@ -279,22 +279,15 @@ def counts_of(active: ActiveCounts, views_of: int | None, **work: int) -> Counts
 
 def _counts(found: Measured, objective: SceneObjective) -> Counts:
     renders = 0 if found.plane is None else found.plane.slice.evaluations * objective.counts.views
-    kept = objective.linearized.kept
-    return counts_of(
-        objective.counts,
-        found.left_out and found.left_out.population,
-        rank=found.rank,
-        views_kept_linearised=kept,
-        products=found.matvecs,
-        renders=renders,
-    )
+    work = {"rank": found.rank, "views_kept_linearised": objective.linearized.kept, "products": found.matvecs}
+    return counts_of(objective.counts, found.left_out and found.left_out.population, **work, renders=renders)
 
 
 def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, float]) -> dict[str, Skip]:
     """Work that products of the exact Hessian skip, over all views, and that estimators did not need.
 
-    The latter's time is that of as many samples or renders as were made.  Products on the GPU also leave out the tiles in which
-    their vectors move nothing, which is not counted.
+    The time that estimators saved is that of the same number of samples or renders that were computed.  Not counted: tiles
+    that a product on the GPU skips because its vectors change nothing in them.
     """
     counts, probes = objective.counts, [trace.probes for trace in found.traces.values()]
 
@@ -324,25 +317,24 @@ def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, fl
 
 
 def _checks(found: Measured) -> dict[str, Check]:
-    operator, derivative = found.operator_check, found.gradient_check.difference
-    rounding = found.gradient_check.rounding
-    # differences are not much better in float64
-    close = max(operator.tolerance, ENOUGH)
-    note = f"gradients {derivative.step:.0e} apart"
-    noise = _check(operator.noise, operator.tolerance)
+    operator, derivative, rounding = (
+        found.operator_check,
+        found.gradient_check.difference,
+        found.gradient_check.rounding,
+    )
+    noise, noise_note, note = operator.noise, UNSET, f"gradients {derivative.step:.0e} apart"
     if rounding is not None:
+        noise = max(noise, rounding)
+        noise_note = "single against double precision, which order depths that are nearly equal each its own way"
         note += ", products in double precision"
-        noise = _check(max(operator.noise, rounding), operator.tolerance)
-        noise.note = "single against double precision, which order depths that are nearly equal each its own way"
-    difference = _check(derivative.error, close)
-    difference.note = note
     return {
         "symmetry": _check(operator.symmetry, operator.tolerance),
-        "round_off": noise,
+        "round_off": _check(noise, operator.tolerance, noise_note),
         "finiteness": _check(0.0 if operator.finite else 1.0, 0.0),
-        "finite_difference": difference,
+        # differences are not much better in float64: hence ENOUGH
+        "finite_difference": _check(derivative.error, max(operator.tolerance, ENOUGH), note),
     }
 
 
-def _check(value: float, bound: float) -> Check:
-    return Check(value=value, bound=bound, passed=value <= bound)
+def _check(value: float, bound: float, note: schema.Maybe[str] = UNSET) -> Check:
+    return Check(value=value, bound=bound, passed=value <= bound, note=note)

@@ -42,10 +42,8 @@ def remarks(data: ProbeRecord, verbose: bool) -> list[Line]:
 def _ends(data: ProbeRecord) -> str:
     texts = []
     for end in (data.eigenvalues.min, data.eigenvalues.max):
-        reached = not (end.reason or "").endswith("budget")
-        texts.append(
-            measured(end.value, end.residual) + apart(end.views_error) if reached else f"{UNDETERMINED} (not reached)"
-        )
+        value = measured(end.value, end.residual) + apart(end.views_error)
+        texts.append(value if end.is_reached else f"{UNDETERMINED} (not reached)")
     return f"curvature from {texts[0]} to {texts[1]}"
 
 

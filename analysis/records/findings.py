@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeGuard
 
 from msgspec import UNSET
 
@@ -24,20 +24,20 @@ ATTRIBUTES = {
     "sh": "colour (SH)",
 }
 END_NAMES = {"max": "largest", "min": "smallest"}
-WIDEST = 10.0  # times its other end: a bracket that still has a value
+WIDEST = 10.0  # ratio of a bracket's ends up to which a value is shown with it
 
 
 @dataclass(frozen=True)
 class Line:
-    """One sentence; a failure is a check that did not hold or a number that is none; open: a number is not known, and what
-    resolves it."""
+    """One sentence.  level: "failure" of a check that failed or a number that is not finite; "open" where a number is not
+    known, with what resolves it."""
 
     text: str
     level: Literal["fact", "caution", "open", "failure"] = "fact"
 
 
 def attribute_name(attribute: str) -> str:
-    """The attribute in the paper's words; a name that is none of the five stays as it is."""
+    """The paper's name of an attribute; other names are returned unchanged."""
     return ATTRIBUTES.get(attribute, attribute)
 
 
@@ -88,18 +88,21 @@ def of_checks(checks: Mapping[str, Check]) -> list[Line]:
     return lines
 
 
+def trace_values(data: ProbeRecord) -> dict[str, float]:
+    """The finite traces, by attribute."""
+    return {name: trace.value for name, trace in data.traces.items() if _is_finite(trace.value)}
+
+
 def _of_traces(data: ProbeRecord) -> list[Line]:
-    traces = data.traces
-    values = {
-        name: trace.value for name, trace in traces.items() if trace.value is not None and math.isfinite(trace.value)
-    }
+    traces, values = data.traces, trace_values(data)
     lines = [
         Line(f"The trace of {attribute_name(name)} is {quantity(trace.value)}{_in_brackets(trace.note)}.", "failure")
         for name, trace in traces.items()
         if name not in values
     ]
     if any(values.values()):
-        lines.append(_of_largest_step(data) or _of_largest_trace(traces, values))
+        steps = largest_steps(data)
+        lines.append(_of_largest_step(*steps) if steps else _of_largest_trace(traces, values))
     elif values:
         lines.append(Line("Every trace is exactly 0."))
     signs = {"negative": "negative: on average the loss curves down there", "undetermined": "not decided by its error"}
@@ -110,7 +113,8 @@ def _of_traces(data: ProbeRecord) -> list[Line]:
 
 
 def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
-    """Share of the loss by which a trace of 1 changes it in a random step, by attribute; empty where that is not known."""
+    """s^2 / (2 L), by attribute: times the trace, the relative change of the loss L by a random step as long as the
+    optimiser's first, s per parameter.  Empty where not known."""
     loss = data.objective.value
     if not data.steps or not loss or not loss > 0 or set(data.traces) - set(data.steps):
         return {}
@@ -118,38 +122,28 @@ def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
 
 
 def largest_steps(data: ProbeRecord) -> tuple[str, str, float] | None:
-    """The attribute whose curvature changes the loss most in a random step as long as the optimiser's first, the next, and
-    the ratio of the changes; None where that is not known or the intervals overlap."""
+    """The two attributes whose curvature changes the loss most in such a step (`shares_per_trace`), and the ratio of the
+    changes; None where not known, or where the first one's interval overlaps another."""
     ends = {
         name: [abs(share * x) for x in data.traces[name].interval] for name, share in shares_per_trace(data).items()
     }
     if len(ends) < 2:
         return None
     first, second, *_ = sorted(ends, key=lambda name: -min(ends[name]))
-    if not min(ends[first]) > max(max(found) for name, found in ends.items() if name != first) > 0:
+    if not min(ends[first]) > max(max(ends[name]) for name in ends if name != first) > 0:
         return None
     return first, second, sum(ends[first]) / sum(ends[second])
 
 
-def _of_largest_step(data: ProbeRecord) -> Line | None:
-    if (found := largest_steps(data)) is None:
-        return None
-    first, second, ratio = found
+def _of_largest_step(first: str, second: str, ratio: float) -> Line:
     return Line(
         f"By its curvature a random step in {attribute_name(first)}, as long as the optimiser's first, changes the loss "
         f"{ratio:.2g} times as much as one in {attribute_name(second)}, the next."
     )
 
 
-def _known(error: schema.Maybe[float | None]) -> float:
-    """Infinite where it is not known, 0 where there is none."""
-    if error is UNSET:
-        return 0.0
-    return math.inf if error is None or math.isnan(error) else error
-
-
 def _of_largest_trace(traces: Mapping[str, schema.Trace], values: Mapping[str, float]) -> Line:
-    """values: of the traces that are numbers, not all 0."""
+    """values: the finite traces, not all 0."""
     first, *others = sorted(values, key=lambda name: -abs(values[name]))
     share = abs(values[first]) / sum(map(abs, values.values()))
     part = "most" if share > 0.5 else "the largest part"
@@ -160,10 +154,10 @@ def _of_largest_trace(traces: Mapping[str, schema.Trace], values: Mapping[str, f
     )
 
     def separated(name: str) -> bool:
-        """Whether two standard errors of the difference of the sizes do not reach 0; an infinite error always does."""
+        """Whether |trace| of the first exceeds this one's by two standard errors of the difference."""
         errors = [error for each in (first, name) for error in (traces[each].standard_error, traces[each].views_error)]
-        width = 2 * math.hypot(*(_known(error) for error in errors))
-        return abs(values[first]) - abs(values[name]) >= width
+        known = [math.inf if error is None or math.isnan(error) else error for error in errors if error is not UNSET]
+        return abs(values[first]) - abs(values[name]) >= 2 * math.hypot(*known)
 
     if near := [attribute_name(name) for name in others if not separated(name)]:
         text += f" Its error does not separate it from {' and '.join(near)}."
@@ -175,7 +169,7 @@ def _of_ends(data: ProbeRecord) -> list[Line]:
     numbers = [number for end in (ends.max, ends.min) for number in (end.value, end.residual) if _is_finite(number)]
     if len(numbers) < 4:
         return [Line("The ends of the spectrum were not determined.", "failure")]
-    top, top_error, bottom, bottom_error = (number for number in numbers if number is not None)
+    top, top_error, bottom, bottom_error = numbers
     where = f"over {data.counts.active_parameters:,} parameters"
     where += f", with a gradient of norm {quantity(norm)}," if _is_finite(norm) else ""
     text = f"{where} the curvature runs from {measured(bottom, bottom_error)} to {measured(top, top_error)}"
@@ -191,27 +185,20 @@ def _of_ends(data: ProbeRecord) -> list[Line]:
 def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
     """Lines on the searches, for the ends "max" and "min", that ended at a budget.
 
-    The residual of what they found says that an eigenvalue is near, not that none lies beyond.
+    Their residual bounds the distance to an eigenvalue, not to the end of the spectrum.
     """
-    return [
-        Line(
-            f"The search for the {END_NAMES[end]} eigenvalue ended at its {reason}: the end may lie farther out.",
-            "caution",
-        )
-        for end, reason in reasons.items()
-        if reason and reason.endswith("budget")
-    ]
+    text = "The search for the {} eigenvalue ended at its {}: the end may lie farther out."
+    spent = {end: reason for end, reason in reasons.items() if reason and reason.endswith("budget")}
+    return [Line(text.format(END_NAMES[end], reason), "caution") for end, reason in spent.items()]
 
 
 def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
     lines, saddle, share = [], family.saddle, family.share
-    steepest = "The steepest direction up is"
+    text = "The steepest direction up is {} times as curved as the steepest down{}."
     if saddle and _is_finite(saddle.value) and not is_open(saddle):
-        text = f"{steepest} {quantity(saddle.value)} times as curved as the steepest down{_bracket(saddle)}."
-        lines.append(Line(text))
+        lines.append(Line(text.format(quantity(saddle.value), _bracket(saddle))))
     elif saddle and saddle.low is not None and 0 < saddle.low < math.inf:
-        text = f"{steepest} at least {quantity(saddle.low)} times as curved as the steepest down{_in_brackets(saddle.note)}."
-        lines.append(Line(text))
+        lines.append(Line(text.format(f"at least {quantity(saddle.low)}", _in_brackets(saddle.note))))
     elif saddle:
         text = f"The ratio of the two ends of the spectrum is not determined{_in_brackets(saddle.note)}."
         lines.append(Line(text, "caution"))
@@ -222,14 +209,13 @@ def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
 
 
 def is_open(index: schema.Index) -> bool:
-    """Whether its bracket has no lower or no upper end; False where it is undefined."""
-    return (index.low is None) != (index.high is None) or (
-        index.low is None and index.high is None and index.value is not None
-    )
+    """Whether its bracket lacks an end; False where value and both ends are None, as it is then undefined."""
+    missing = [index.low, index.high].count(None)
+    return missing == 1 or (missing == 2 and index.value is not None)
 
 
 def is_wide(index: schema.Index | schema.Effect) -> bool:
-    """Whether the ends of its bracket are too far apart for any value between them to be one."""
+    """Whether its bracket includes 0 or its ends differ by more than WIDEST: no value is shown."""
     if index.low is None or index.high is None:
         return False
     near, far = sorted((abs(index.low), abs(index.high)))
@@ -237,7 +223,7 @@ def is_wide(index: schema.Index | schema.Effect) -> bool:
 
 
 def is_loose(index: schema.Index) -> bool:
-    """Whether its bracket is open or wide, so that no value is shown."""
+    """Whether its bracket is open or wide: no value is shown."""
     return is_open(index) or is_wide(index)
 
 
@@ -267,14 +253,12 @@ def _with(command: str, option: str, value: int) -> str:
 
 def _of_open(data: ProbeRecord) -> list[Line]:
     """The indices without a finite or useful bracket: the bracket, and the command that resolves it."""
-    return [
-        Line(
-            f"{name.replace('_', ' ').capitalize()}: {UNDETERMINED}{_bracket(index)}; {remedy(data, name)}.",
-            "open" if is_open(index) else "caution",
-        )
-        for name, index in data.anisotropy.items()
-        if is_loose(index)
-    ]
+    lines = []
+    for name, index in data.anisotropy.items():
+        if is_loose(index):
+            text = f"{name.replace('_', ' ').capitalize()}: {UNDETERMINED}{_bracket(index)}; {remedy(data, name)}."
+            lines.append(Line(text, "open" if is_open(index) else "caution"))
+    return lines
 
 
 def _of_needles(where: schema.Maybe[schema.LivesOn], counts: Counts) -> list[Line]:
@@ -334,20 +318,19 @@ def _of_depth(depth: schema.Depth | None) -> list[Line]:
 
 
 def _of_block_shares(shares: Sequence[schema.BlockShare]) -> list[Line]:
-    """Lines on what methods assume that keep the diagonal blocks of Gaussians, or the diagonal, of an operator."""
+    """How much of an operator its block-diagonal and diagonal approximations keep: shares of its squared entries."""
     names, parts = {"hessian": "the Hessian", "gauss-newton": "Gauss-Newton"}, []
     for one in shares:
         if one.blocks is not None and one.diagonal is not None:
-            share = f"{measured(100 * one.blocks, 100 * one.blocks * one.relative_error)}% ({one.diagonal:.0%} on the diagonal)"
-            parts.append(
-                f"of {names[one.operator]}{'' if one.coupled else ' without the coupling of pixels by SSIM'} {share}"
-            )
+            operator = names[one.operator] + ("" if one.coupled else " without the coupling of pixels by SSIM")
+            share = measured(100 * one.blocks, 100 * one.blocks * one.relative_error)
+            parts.append(f"of {operator} {share}% ({one.diagonal:.0%} on the diagonal)")
     text = "Of the sum of all squared entries, this lies within the Gaussians' own blocks (11 x 11, and the diagonal of SH): "
     return [Line(f"{text}{', '.join(parts)}.")] if parts else []
 
 
 def _of_skips(skipped: Mapping[str, Skip]) -> list[Line]:
-    """Lines on work left out, the largest saving first."""
+    """Work left out, the largest saving first."""
     parts = []
     for name, skip in sorted(skipped.items(), key=lambda item: -(item[1].seconds_saved or 0.0)):
         if skip.count:
@@ -359,19 +342,19 @@ def _of_skips(skipped: Mapping[str, Skip]) -> list[Line]:
 def _of_counts(counts: Counts) -> list[Line]:
     lines = []
     if unseen := counts.gaussians - counts.visible_gaussians:
-        lines.append(
-            Line(f"{unseen:,} of {counts.gaussians:,} Gaussians touch no pixel of any view and were left out.")
-        )
+        text = f"{unseen:,} of {counts.gaussians:,} Gaussians touch no pixel of any view and were left out."
+        lines.append(Line(text))
     if counts.sh_degree_active < counts.sh_degree_stored:
         degrees = f"degree {counts.sh_degree_active} of {counts.sh_degree_stored}"
-        lines.append(Line(f"Colour uses spherical harmonics of {degrees}; the bands above were left out."))
+        text = f"Colour uses spherical harmonics of {degrees}; the bands above were left out."
+        lines.append(Line(text))
     used = f"{counts.active_parameters:,} of {counts.parameters:,} parameters"
     views = f"{counts.views} of {counts.views_of}" if counts.views_of else f"{counts.views}"
     return [*lines, Line(f"The operator acts on {used}, over {views} views.")]
 
 
 def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
-    """The sentences of a slice alone.  made: where its record comes from."""
+    """Sentences on a slice.  made: the provenance of its record."""
     if plane is None:
         return [Line("No slice of the loss was recorded.", "caution")]
     lines, error, count = [], plane.interpolation_error, plane.holdout_points
@@ -380,9 +363,7 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
         lines.append(Line(unresolved(plane, made), "caution"))
     elif rendered < plane.points:
         text = f"Of the slice's {plane.points:,} points {rendered:,} are renders, among them all of both axes; the others are "
-        text += "interpolated" + (
-            f" to {100 * plane.tolerance:.2g}% of the range of the loss" if plane.tolerance else ""
-        )
+        text += f"interpolated{_to_tolerance(plane)}"
         seen = error if plane.error_seen in (None, UNSET) else plane.error_seen
         size = f"at most {100 * seen:.2g}%" if seen is not None else "without bound"
         text += f" (the error at {count} random point{'' if count == 1 else 's'}: {size}"
@@ -396,25 +377,28 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
 
 def unresolved(plane: schema.Slice, made: Provenance) -> str:
     """Why a plane is not drawn, and the command that resolves it."""
-    asked = "" if not plane.tolerance else f" to {100 * plane.tolerance:.2g}% of the range of the loss"
     limited = "--max-renders" in (made.command or "")
     remedy = "leave out --max-renders" if limited else f"landscape slice {made.checkpoint} renders more"
     return (
-        f"Between its two sections the plane is not known{asked} from {plane.evaluated_points:,} of {plane.points:,} renders, "
-        f"and no surface is drawn; {remedy}."
+        f"Between its two sections the plane is not known{_to_tolerance(plane)} from {plane.evaluated_points:,} of "
+        f"{plane.points:,} renders, and no surface is drawn; {remedy}."
     )
+
+
+def _to_tolerance(plane: schema.Slice) -> str:
+    return f" to {100 * plane.tolerance:.2g}% of the range of the loss" if plane.tolerance else ""
 
 
 def _sentence(note: str) -> str:
     return f"{note[:1].upper()}{note[1:]}" + ("" if note.endswith((".", "!", "?")) else ".")
 
 
-def _is_finite(number: schema.Number) -> bool:
+def _is_finite(number: schema.Number) -> TypeGuard[float]:
     return number is not None and math.isfinite(number)
 
 
 def _bracket(index: schema.Index, written: Callable[[float], str] | None = None) -> str:
-    """Between which numbers it lies.  written: how one of them is, where not as `limits` has them."""
+    """Its bracket in words.  written: formats an end; by default `limits` formats both."""
     ends = index.low, index.high
     texts = limits(*ends) if written is None else [UNDETERMINED if end is None else written(end) for end in ends]
     if None not in ends:

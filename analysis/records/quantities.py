@@ -1,10 +1,8 @@
-"""Numbers with errors, written for people: `(1.23 ± 0.04) × 10⁵`.
+"""Numbers as text, with their errors: `(1.23 ± 0.04) × 10⁵`; and as colours: `Shade`.
 
-The error is rounded to two significant digits and the value to the same place; without an error a number keeps three
-significant digits.  None, *not determined* in a record, is an en dash.
-The spaces within a number are HARD: it stays in one line.
-
-`Shade` is how numbers of many sizes are written in colours.
+The error is rounded to two significant digits and the value to the same place; without an error a number has three
+significant digits.  None, *not determined* in a record, is an en dash.  The spaces within a number are HARD, so that it is
+not broken over lines.
 """
 
 import math
@@ -14,15 +12,15 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import UNSET, Struct, UnsetType, structs
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
 HARD = "\N{NO-BREAK SPACE}"
 PLUS_MINUS, TIMES = f"{HARD}±{HARD}", f"{HARD}×{HARD}"
 FINEST = 10  # significant digits
-BYTES, NOTHING = 254, 255  # of a scale in bytes: its end, and what has no value
-GREY = 128  # in bytes, of what has no value
+BYTES, NOTHING = 254, 255  # of a scale in bytes: its upper end, and the code of no value
+GREY = 128  # the colour of no value, in bytes
 SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}  # of metrics.json
 PLACES = {"psnr": 2, "ssim": 4, "lpips": 4}
 
@@ -52,7 +50,7 @@ def quantity(value: float | None, error: float | None = None) -> str:
 
 
 def measured(value: float | None, error: float | None) -> str:
-    """`quantity` for a number that comes with an error: where that is not determined, it says so.
+    """`quantity` of a number that has an error; an error of None, not determined, is written "± ?".
 
     >>> [text.replace(HARD, " ") for text in (measured(5.0, None), measured(5.0, 0.0), measured(None, None))]
     ['5.00 ± ?', '5.00', '–']
@@ -61,7 +59,7 @@ def measured(value: float | None, error: float | None) -> str:
 
 
 def apart(error: float | UnsetType | None) -> str:
-    """A second error, of views left out, after a number; empty where none were.
+    """The error due to views left out, to follow a number's own error; empty where none were left out.
 
     >>> apart(0.123), apart(None), apart(UNSET)
     (' ∓ 0.12', ' ∓ ?', '')
@@ -72,7 +70,7 @@ def apart(error: float | UnsetType | None) -> str:
 
 
 def percent(share: float) -> str:
-    """A share as a percentage, with a place more where it is small or nearly all.
+    """A share as a percentage, with one more place near 0 and near 1.
 
     >>> percent(0.314), percent(0.0031), percent(0.9987), percent(1.0), percent(0.0), percent(1e-5)
     ('31%', '0.3%', '99.9%', '100%', '0%', 'less than 0.1%')
@@ -83,7 +81,7 @@ def percent(share: float) -> str:
 
 
 def ratio(aspect: float) -> str:
-    """How many times as long as wide.
+    """Aspect ratio, length to width.
 
     >>> ratio(20.8), ratio(3.14)
     ('21 : 1', '3.1 : 1')
@@ -117,7 +115,7 @@ def power_of_ten(exponent: int) -> str:
 
 
 def exponent_of(*values: np.ndarray | float) -> int:
-    """The power of ten to take out of an axis: a multiple of three, 0 for numbers that read well as they are.
+    """The power of ten to take out of an axis: a multiple of three, 0 for numbers of 0.05 to 5000.
 
     >>> exponent_of(4.2e-7), exponent_of(np.array([0.0, 30.0])), exponent_of(-8.1e9)
     (-9, 0, 9)
@@ -130,7 +128,7 @@ def exponent_of(*values: np.ndarray | float) -> int:
 
 
 def unit_suffix(exponent: int) -> str:
-    """Suffix of an axis label for a power that was taken out.
+    """Suffix of an axis label for the power of ten that was taken out.
 
     >>> unit_suffix(-6), unit_suffix(0)
     (' (×10⁻⁶)', '')
@@ -139,7 +137,7 @@ def unit_suffix(exponent: int) -> str:
 
 
 def _plain(value: float, digits: int = 3) -> str:
-    """`value` with so many significant digits."""
+    """`value` with this many significant digits."""
     exponent = _exponent(value)
     if value == 0:
         return "0"
@@ -149,21 +147,21 @@ def _plain(value: float, digits: int = 3) -> str:
 
 
 def _fixed(value: float, exponent: int, places: int) -> str:
-    """value / 10**exponent, rounded to so many places; Decimal, because 10.0**exponent may underflow."""
+    """value / 10**exponent, rounded to this many places; by Decimal, because 10.0**exponent may underflow."""
     scaled = round(Decimal(value).scaleb(-exponent), places)
     return f"{scaled:.{max(0, places)}f}".replace("-", "−")
 
 
 def _exponent(value: float) -> int:
-    """Exponent of the leading digit after rounding to three digits; 0 for 0."""
+    """Decimal exponent of the leading digit after rounding to three digits; 0 for 0."""
     return int(f"{value:.2e}".partition("e")[2])
 
 
 class Shade(Struct, frozen=True, kw_only=True):
-    """A scale of colours for a field: v is shown as t, from `low` to `high`.
+    """A colour scale of a field: a value v has the colour of t, on a map from t = `low` to t = `high`.
 
     log      t = log10 v, v > 0
-    signed   t = asinh(v / soft), the same reach on both sides of 0 where v has both signs
+    signed   t = asinh(v / soft), with low = -high where v has both signs
     linear   t = v
     """
 
@@ -186,24 +184,23 @@ class Shade(Struct, frozen=True, kw_only=True):
         weights: Float[np.ndarray, " n"],
         percentiles: tuple[float, float] = (10.0, 98.0),
     ) -> "Shade":
-        """The scale whose ends are percentiles of the values, each of which counts by its weight; soft: their median size.
+        """The scale whose ends are weighted percentiles of the values; soft: their weighted median magnitude.
 
         >>> shade = Shade.of("x", "size", "px", "log", np.array([1.0, 10.0, 1e3]), np.ones(3))
         >>> shade.low, shade.high, shade.share(np.array([1.0, 1e9, -1.0])).tolist()
         (0.0, 3.0, [0.0, 1.0, nan])
         """
+        shade = cls(name=name, words=words, unit=unit, scale=scale, low=0.0, high=1.0)
         used = np.isfinite(values) & (weights > 0) & ((values > 0) | (scale != "log"))
         if not used.any():
-            return cls(name=name, words=words, unit=unit, scale=scale, low=0.0, high=1.0)
+            return shade
         values, weights = values[used], weights[used]
-        soft = float(_quantiles(np.abs(values), weights, 50.0)) or float(np.abs(values).max()) or 1.0
-        shade = cls(name=name, words=words, unit=unit, scale=scale, low=0.0, high=1.0, soft=soft)
-        low, high = (float(shade.shown(np.array(_quantiles(values, weights, each)))) for each in percentiles)
+        soft = _percentile(np.abs(values), weights, 50.0) or float(np.abs(values).max()) or 1.0
+        shade = structs.replace(shade, soft=soft)
+        low, high = (float(shade.shown(np.array(_percentile(values, weights, each)))) for each in percentiles)
         if scale == "signed" and low < 0 < high:
             low, high = -max(-low, high), max(-low, high)
-        return cls(
-            name=name, words=words, unit=unit, scale=scale, low=low, high=high if high > low else low + 1, soft=soft
-        )
+        return structs.replace(shade, low=low, high=high if high > low else low + 1)
 
     @property
     def title(self) -> str:
@@ -212,25 +209,25 @@ class Shade(Struct, frozen=True, kw_only=True):
 
     @property
     def diverges(self) -> bool:
-        """Whether 0 is in the middle."""
+        """Whether t = 0 is in the middle."""
         return self.scale != "log" and self.low == -self.high
 
     @property
     def colours(self) -> str:
-        """Name of the map of matplotlib, which colour-blind eyes tell apart; what is fragile or wrong is bright."""
+        """Name of matplotlib's colour map, one for colour-blind eyes, in which the fragile or wrong values are bright."""
         if self.diverges:
             return "PuOr_r"
         return "magma" if self.name == "error" else "cividis_r" if self.falls else "cividis"
 
     @property
     def falls(self) -> bool:
-        """Whether the scale is drawn from high to low: bright is at its right end, as everywhere."""
+        """Whether the scale is drawn from high to low, so that its bright end is at the right, as in all other scales."""
         return self.name == "order_gap"
 
     @property
     def palette(self) -> UInt8[np.ndarray, "256 3"]:
-        """The colours of `bytes`; grey: no value."""
-        from matplotlib import colormaps  # most readers of a record need none
+        """The colours of `bytes`; grey of no value."""
+        from matplotlib import colormaps  # slow to import, and most readers of a record need no colours
 
         colours = colormaps[self.colours](np.arange(NOTHING + 1) / BYTES)[:, :3]
         colours[NOTHING] = GREY / 255
@@ -238,12 +235,13 @@ class Shade(Struct, frozen=True, kw_only=True):
 
     @property
     def legend(self) -> str:
-        """The colours and the values at both ends, as a part of a page."""
+        """The colours and the values at both ends, in HTML."""
         stops = ", ".join(
             "rgb({}, {}, {})".format(*colour) for colour in self.palette[np.linspace(0, BYTES, 9, dtype=int)]
         )
-        ends, way = [quantity(self.value(t)) for t in (self.low, self.high)], "left" if self.falls else "right"
-        ends = ends[::-1] if self.falls else ends
+        ends, way = [quantity(self.value(t)) for t in (self.low, self.high)], "right"
+        if self.falls:
+            ends, way = ends[::-1], "left"
         middle = "<span>logarithmic</span>" if self.scale == "log" else ""
         return (
             f'<span style="display:block;height:.5em;background:linear-gradient(to {way}, {stops})"></span><span '
@@ -255,7 +253,7 @@ class Shade(Struct, frozen=True, kw_only=True):
         return (self.palette[self.bytes(values)] / 255).astype(np.float32)
 
     def shown(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """t; nan for what has none."""
+        """t; nan where it is not defined."""
         values = np.asarray(values, float)
         if self.scale == "log":
             return np.log10(np.where(values > 0, values, np.nan))
@@ -266,16 +264,16 @@ class Shade(Struct, frozen=True, kw_only=True):
         return 10.0**t if self.scale == "log" else self.soft * math.sinh(t) if self.scale == "signed" else t
 
     def share(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Position of t between `low` and `high`, within [0, 1]; nan for what is not finite."""
+        """Position of t between `low` and `high`, within [0, 1]; nan where t is not finite."""
         t = self.shown(values)
         return np.where(np.isfinite(t), np.clip((t - self.low) / (self.high - self.low), 0, 1), np.nan)
 
     def bytes(self, values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
-        """`share` in bytes, see `share_in_bytes`."""
+        """`share` by `share_in_bytes`."""
         return share_in_bytes(self.share(values))
 
     def ticks(self) -> list[tuple[float, str]]:
-        """(share, text) of round values within the scale; none where it is linear.
+        """(share, text) of round values within the scale; none of a linear one.
 
         >>> Shade(name="x", words="", unit="", scale="log", low=-0.5, high=2.5).ticks()[1:]
         [(0.5, '10'), (0.8333333333333334, '100')]
@@ -305,7 +303,7 @@ def share_in_bytes(share: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
 
 
 def _labels(values: Sequence[float]) -> list[str]:
-    """Round numbers as labels, without places that say nothing; all as powers of ten where one needs it.
+    """Round numbers as labels, without trailing zeros; all as powers of ten where one needs it.
 
     >>> _labels([-0.01, 0.0, 0.5]), _labels([-2e-5, 0.0, 1.0])
     (['−0.01', '0', '0.5'], ['−2 × 10⁻⁵', '0', '1'])
@@ -320,8 +318,8 @@ def _labels(values: Sequence[float]) -> list[str]:
     return texts
 
 
-def _quantiles(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], percent: float) -> float:
-    """The least of the values that, with all smaller ones, has so much of the weight."""
+def _percentile(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], percent: float) -> float:
+    """Weighted percentile: the least value whose weight, with that of all smaller ones, reaches this share of the total."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
     return float(values[order][min(np.searchsorted(total, percent / 100 * total[-1]), len(order) - 1)])

@@ -1,4 +1,4 @@
-"""Record folders: what a probe or a slice found, written so that a crash never leaves a mixture, and checked on reading.
+"""Record folders: results of a probe or a slice, written atomically and checked on reading.
 
     RUN/probe/probe.json, RUN/slice-.../slice.json    every number: `ProbeRecord`, `SliceRecord`
     GROUP.npz                                         one for each group of arrays: ARRAYS
@@ -36,17 +36,17 @@ ARRAYS = {
     "slice": {"x": "nx", "y": "ny?", "loss": "grid", "model": "grid?", "evaluated": "grid?", "crossed": "grid?"},
     "directions": {"vectors": "parameters d"},
 }
-"""Group, a file `GROUP.npz` each -> name -> shape; ?: may be absent, as any group may.
+"""Group (file `GROUP.npz`) -> name -> shape.  ?: may be absent, as any group may.
 
 spectrum      ritz_values, residuals: approximate eigenvalues, the two ends among them; where the density was estimated also
-              nodes, weights: a quadrature for each start vector, eigenvalues that are known among the nodes of all
+              nodes, weights: a quadrature for each start vector; known eigenvalues are among the nodes of each
 eigenvectors  unit vectors of the k largest and the m smallest eigenvalues, of the Gaussians in sight
 traces        ATTRIBUTE: the samples whose mean is the trace
 families      SCENE.OPERATOR.BLOCK.nodes and .weights: the quadrature of each family's density
 slice         x, y: increasing steps along the directions; loss: L on the grid, [nx, ny] or, along a line, [nx]; model: the
-              quadratic model there; evaluated (boolean): true where loss is a render, false where it is interpolated (absent:
-              all are renders); crossed (boolean): true where a render's order of the splats or set of visible ones is not that
-              of the centre; false and not known where interpolated
+              quadratic model there; evaluated (boolean): true where loss is rendered, false where interpolated (absent: all are
+              rendered); crossed (boolean): true where the order of the splats or the set of visible ones is not that of the
+              centre; false, as not known, where interpolated
 directions    of a `landscape slice`: its directions as columns, of the Gaussians in sight or, for a line, of all
 """
 BOOLEAN = {"evaluated", "crossed"}
@@ -61,9 +61,11 @@ class Format(Struct, frozen=True):
 
 
 class Counts(Struct, kw_only=True):
-    """visible_gaussians: that touch a pixel.  active_parameters: of these, without SH bands that are not in use and the
-    lengths of quaternions.  views_of: training views that there are, where fewer were measured.  rank: of the active operator.
-    products: H v made.  renders: of single views.
+    """Sizes of the problem and of the work.
+
+    visible_gaussians: that touch a pixel.  active_parameters: of these, without unused SH bands and the lengths of quaternions.
+    views_of: number of training views, where fewer were measured.  rank: of the active operator.  products: H v computed.
+    renders: of single views.
     """
 
     gaussians: Count
@@ -83,7 +85,7 @@ class Counts(Struct, kw_only=True):
 
 
 class Check(Struct, kw_only=True):
-    """value: what was measured; bound: what it must not exceed; passed: None where the check could not run (see note)."""
+    """A self-check: value must not exceed bound.  passed: None where the check could not run (see note)."""
 
     value: Number
     bound: Number
@@ -92,7 +94,7 @@ class Check(Struct, kw_only=True):
 
 
 class Skip(Struct, kw_only=True):
-    """Work that the scene did not need.  seconds_saved: estimated from the time of the work done; None where not known."""
+    """Work that was not needed.  seconds_saved: estimated from the time of the work done; None where not known."""
 
     count: Count
     seconds_saved: Number
@@ -105,8 +107,8 @@ class ProbeRecord(Struct, kw_only=True):
     """Results of `landscape probe`.
 
     traces: by attribute (means, log_scales, quats, opacity_logits, sh).  quantiles: share -> the eigenvalue that this share of
-    all active ones does not exceed; None without a density.  finite_probe, depth, slice: None where they were left out.
-    steps: by attribute, how far the optimiser's first step moves a parameter.  skipped: by what was skipped.  checks: symmetry,
+    all active ones does not exceed; None without a density.  finite_probe, depth, slice: None where left out.
+    steps: length of the optimiser's first step in a parameter, by attribute.  skipped: by the kind of work.  checks: symmetry,
     round_off, finiteness, finite_difference.  timing: stage -> seconds, in the order run, and "total".  notes: sentences on
     what was skipped, capped, or not reached.  arrays: group -> name -> shape.
     """
@@ -176,9 +178,9 @@ class Record(Generic[Data]):
 def record_folder(folder: str | Path, mark: str = ProbeRecord.FILE) -> Iterator[Path]:
     """A new, empty folder that becomes `folder` when the block ends, all at once; nothing changes if the block fails.
 
-    mark: the file by which a record of this kind is known; an old one at `folder` is replaced.  Killed at any point, `folder`
-    is the old record, the new one, or (between two renames) absent with the old record complete in `.NAME.previous` beside it,
-    from where the next use restores it.
+    mark: the file that every record of this kind has; an old record at `folder` is replaced.  After a kill at any point,
+    `folder` is the old record, the new one, or (between two renames) absent, with the old one in `.NAME.previous` beside it,
+    which the next use restores.
     """
     folder = Path(folder).resolve()  # a link stays one
     require_replaceable(folder, mark)
@@ -188,7 +190,7 @@ def record_folder(folder: str | Path, mark: str = ProbeRecord.FILE) -> Iterator[
         _clean_up_after_kills(folder, previous)
         partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
         try:
-            partial.mkdir()  # in here: a signal may come as it returns
+            partial.mkdir()  # within try, as a signal may arrive before the next statement
             yield partial
             for file in (path for path in partial.rglob("*") if path.is_file()):
                 with file.open("rb") as stream:
@@ -201,15 +203,15 @@ def record_folder(folder: str | Path, mark: str = ProbeRecord.FILE) -> Iterator[
             if previous.exists() and not folder.exists():
                 previous.rename(folder)
             if isinstance(error, OSError) and error.errno and error.filename is None:
-                error.filename = str(folder)  # a full disk's error has none
+                error.filename = str(folder)  # the error of a full disk lacks it
             raise
         _remove(previous)
 
 
 def write_record(folder: str | Path, data: ProbeRecord | SliceRecord, arrays: Mapping[str, Mapping[str, Any]]) -> Path:
-    """Write the JSON and the arrays into `folder` (which `record_folder` gave); returns the path of the JSON.
+    """Write the JSON and the arrays into `folder` (of `record_folder`); returns the path of the JSON.
 
-    Raises InputError where a value is not what the record's type says, or an array is none of numbers.
+    Raises InputError where a value is not of the record's type, or an array holds objects.
     """
     data.arrays = {g: {name: list(np.shape(array)) for name, array in names.items()} for g, names in arrays.items()}
     path = write_data(folder, data)
@@ -217,13 +219,13 @@ def write_record(folder: str | Path, data: ProbeRecord | SliceRecord, arrays: Ma
         numeric: dict[str, Any] = {name: np.asarray(array) for name, array in names.items()}
         if objects := [name for name, array in numeric.items() if array.dtype.hasobject]:
             raise InputError(f"expected numbers in the array {group}.{objects[0]}, got objects")
-        # not compressed: eigenvectors, by far the largest, would take a tenth of a second for 2% less
+        # not compressed: eigenvectors, by far the largest, hardly shrink
         np.savez(Path(folder) / f"{group}.npz", **numeric)
     return path
 
 
 def write_data(folder: str | Path, data: ProbeRecord | SliceRecord) -> Path:
-    """The JSON alone, anew, of a record whose arrays are in `folder`; else as `write_record`."""
+    """Write the JSON again, of a record whose arrays are in `folder`; as `write_record`."""
     content = encoded(plain(data))
     fitted(decoded(content), type(data), "a record that cannot be read again", "")
     path = Path(folder) / data.FILE
@@ -233,9 +235,9 @@ def write_data(folder: str | Path, data: ProbeRecord | SliceRecord) -> Path:
 
 
 def read_record(folder: str | Path, kind: type[Data] | None = None) -> Record[Data]:
-    """Read the record in `folder` (or the JSON given).  FileNotFoundError or InputError say what is wrong.
+    """Read the record in `folder` (or the JSON given).  Raises FileNotFoundError or InputError.
 
-    kind: of the record; None: of that which is there.
+    kind: type of the record; None: a slice where its file is there, else a probe.
     """
     folder = Path(folder)
     folder = folder.parent if folder.name in (ProbeRecord.FILE, SliceRecord.FILE) else folder
@@ -265,7 +267,7 @@ def read_record(folder: str | Path, kind: type[Data] | None = None) -> Record[Da
 
 
 def _read_arrays(folder: Path, group: str, shapes: Mapping[str, list[int]], again: str) -> dict[str, np.ndarray]:
-    """The arrays of a group that the record names.  InputError or FileNotFoundError where one is not as ARRAYS has it."""
+    """The arrays of a group that the record lists.  FileNotFoundError without the file, InputError where ARRAYS is violated."""
     path = folder / f"{group}.npz"
     shapes = {name: shape for name, shape in shapes.items() if name in ARRAYS[group] or "*" in ARRAYS[group]}
     if not path.is_file():
@@ -280,7 +282,7 @@ def _read_arrays(folder: Path, group: str, shapes: Mapping[str, list[int]], agai
 
 
 def _archive(stream: BinaryIO) -> Any:
-    """The arrays of an .npz, read when they are asked for."""
+    """The arrays of an .npz, each read on access, after a check of their sizes."""
     with zipfile.ZipFile(stream) as archive:
         require_modest(archive)
         for member in archive.infolist():
@@ -293,7 +295,7 @@ def _archive(stream: BinaryIO) -> Any:
 
 @contextmanager
 def refusing_damage(what: str, path: Path, remedy: str) -> Iterator[None]:
-    """InputError that names the file for whatever reading its bytes raises: numpy and zipfile may raise nearly anything."""
+    """Turn every error but MemoryError into an InputError that names the file: numpy and zipfile may raise nearly anything."""
     try:
         yield
     except MemoryError:
@@ -303,13 +305,13 @@ def refusing_damage(what: str, path: Path, remedy: str) -> Iterator[None]:
 
 
 def _require_arrays(group: str, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, list[int]]) -> None:
-    """ValueError says what is not as the record's shapes and ARRAYS have it."""
+    """Raise ValueError where arrays differ from the record's shapes or from ARRAYS."""
     sizes: dict[str, int] = {}
     for name, shape in shapes.items():
         if name not in arrays:
             raise ValueError(f"no {name}")
         array, kind = arrays[name], "boolean" if name in BOOLEAN else "floating"
-        if not isinstance(array, np.ndarray):  # numpy gives the bytes of what is none
+        if not isinstance(array, np.ndarray):  # of a member that is no .npy, numpy returns the bytes
             raise ValueError(f"no array as {name}")
         if array.shape != tuple(shape):
             raise ValueError(f"{name} of shape {list(array.shape)} instead of {shape}")
@@ -339,7 +341,7 @@ def _why_not_found(folder: Path, command: str, file: str) -> str:
 
 
 def require_replaceable(folder: Path, mark: str = ProbeRecord.FILE) -> None:
-    """Replacing deletes: raise InputError unless folder is absent, empty or an older record, which has the file `mark`."""
+    """Raise InputError unless folder is absent, empty or an older record, with the file `mark`: replacing it deletes it."""
     if folder.is_dir() and any(folder.iterdir()) and not (folder / mark).is_file():
         raise InputError(
             f"expected an empty folder or an older record to replace, got {folder} without {mark}; move it away"

@@ -6,6 +6,7 @@ to a network.  Text from the record is escaped.
 
 import base64
 import gzip
+import html
 import io
 import math
 from collections.abc import Mapping
@@ -28,6 +29,7 @@ from analysis.records.findings import (
     is_open,
     largest_steps,
     shares_per_trace,
+    trace_values,
 )
 from analysis.records.json_files import plain
 from analysis.records.quantities import exponent_of, limits, measured, percent, quantity, ratio, unit_suffix
@@ -39,7 +41,11 @@ from landscape.slices.eye import eye_over
 from splat.model.untrusted import replacing
 
 FILE, SPLATS = "report.html", "view.html"  # in the record's folder, and beside it: the page of `landscape view --html`
-FINE, COARSE, QUICK = 82, 60, 2  # quality of WebP: of drawings, and of maps, which are noisy; effort, of 6
+FINE, COARSE, EFFORT = (
+    82,
+    60,
+    2,
+)  # quality of WebP: of drawings, and of maps, which are noisy; effort of its encoder, 0 to 6
 PICTURES = {
     "slice2d": "The loss on the plane of the two steepest directions. Dots: renders, blue where the order of the splats or the "
     "set of visible ones is not the checkpoint's; dashed: the quadratic model.",
@@ -70,7 +76,7 @@ def write_report(folder: str | Path) -> Path:
 
 @cache
 def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environment:
-    """Of the pages whose templates lie in a folder, by default beside this file; each is compiled once."""
+    """Jinja2 environment of the templates in a folder, by default those beside this file; each is compiled once."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(folder),
         autoescape=True,
@@ -92,75 +98,73 @@ def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environ
 
 
 def render_report(record: Record[ProbeRecord]) -> str:
-    """The page as text; its parts are packed at once, in parallel."""
-    surface, found = interactive_surface(record), map_beside(record)
-    first, drawn = opening(record.data, found), (captions(record.data), shown_numbers(record))
+    """The page as text.  Pictures and plotly.js are compressed in parallel."""
+    data, run = record.data, record.folder.parent
+    surface, mapped = interactive_surface(record), map_beside(record)
+    first = opening(data, mapped)
+    captions = PICTURES | ({"traces": COMPARED} if shares_per_trace(data) else {})
     with ThreadPoolExecutor() as pool:
         packed = pool.submit(_packed_plotly) if surface else None
-        pictures = pool.submit(pictures_in, record.folder, *drawn)
-        places = pool.submit(where, record.folder.parent / MAP, found, first[-1].text)
-        views = views_in(record, found)
-    start = first_view(found, views)
-    return (
-        template_environment()
-        .get_template("report.html.jinja")
-        .render(
-            data=record.data,
-            counts=plain(record.data.counts),
-            provenance=plain(record.data.provenance),
-            subtitle=subtitle(record.data),
-            numbers=numbers(record.data, found),
-            headline=first,
-            findings=findings(record.data),
-            views=views,
-            listed_views=[
-                {**view, "pictures": [{**each, "uri": ""} for each in view["pictures"]]} if i == start else view
-                for i, view in enumerate(views)
-            ],
-            start=start,
-            title=title(record.data),
-            checks=passed(record.data),
-            pictures=pictures.result(),
-            where=places.result(),
-            splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
-            families=family_lines(record.data),
-            indices=INDICES,
-            surface=surface,
-            plotly_js=packed.result() if packed else "",
-        )
+        pictures = pool.submit(pictures_in, record.folder, captions, shown_numbers(record))
+        places = pool.submit(map_pictures, run / MAP, mapped, first[-1].text)
+        views = views_in(record, mapped)
+    start = first_view(mapped, views)
+    listed = list(views)
+    if views:  # the pictures of this view are in the page once, as images; the script reads them from there
+        listed[start] = views[start] | {"pictures": [each | {"uri": ""} for each in views[start]["pictures"]]}
+    template = template_environment().get_template("report.html.jinja")
+    return template.render(
+        data=data,
+        counts=plain(data.counts),
+        provenance=plain(data.provenance),
+        subtitle=subtitle(data),
+        numbers=numbers(data, mapped),
+        headline=first,
+        findings=findings(data),
+        views=views,
+        listed_views=listed,
+        start=start,
+        title=title(data),
+        checks=passed(data),
+        pictures=pictures.result(),
+        where=places.result(),
+        splats=f"../{SPLATS}" if (run / SPLATS).is_file() else "",
+        families=family_lines(data),
+        indices=INDICES,
+        surface=surface,
+        plotly_js=packed.result() if packed else "",
     )
 
 
 def title(data: ProbeRecord) -> str:
-    """What the page is about: scene, views and steps, as far as they are known."""
-    made, count = data.provenance, data.counts.views
-    steps = plain(made).get("iteration")
-    parts = [f"Loss landscape of {made.scene or 'a checkpoint'}", f"{count:,} view{'' if count == 1 else 's'}"]
+    """Title of the page: scene, views and steps, as far as they are known."""
+    scene, steps, count = data.provenance.scene, plain(data.provenance).get("iteration"), data.counts.views
+    parts = [f"Loss landscape of {scene or 'a checkpoint'}", f"{count:,} view{'' if count == 1 else 's'}"]
     return ", ".join(parts + ([] if steps is None else [f"{steps:,} steps"]))
 
 
 def passed(data: ProbeRecord) -> str:
-    """How many of the self-checks passed, and how many could not run; empty without any."""
+    """Number of self-checks that passed, and of those that could not run, in words; empty without checks."""
     results = [check.passed for check in data.checks.values()]
     text = f"{sum(map(bool, results))} of {len(results)} passed" if results else ""
     return text + (f", {missing} could not run" if (missing := results.count(None)) else "")
 
 
-def first_view(found: MapRecord | None, views: list[dict[str, Any]]) -> int:
-    """The place of the view that the opening names, else of the first."""
-    named = found.steepest[0].view if found and found.steepest else None
+def first_view(mapped: MapRecord | None, views: list[dict[str, Any]]) -> int:
+    """Index of the view that the opening names, else 0."""
+    named = mapped.steepest[0].view if mapped and mapped.steepest else None
     return next((i for i, view in enumerate(views) if view["name"] == named), 0)
 
 
-def opening(data: ProbeRecord, found: MapRecord | None) -> list[Line]:
-    """The three sentences at the top: where a map knows which Gaussian carries the steepest direction, it has the last one."""
+def opening(data: ProbeRecord, mapped: MapRecord | None) -> list[Line]:
+    """The three sentences at the top.  The last is the map's on the steepest direction, where there is one."""
     lines = headline(data)
-    if found is None or not found.steepest:
+    if mapped is None or not mapped.steepest:
         return lines
-    if any(end.curvature < 0 and end.is_refuted for end in found.steepest):
+    if any(end.curvature < 0 and end.is_refuted for end in mapped.steepest):
         refuted = "Renders do not confirm its negative end: the loss rises along it at every length that was tried."
         lines[0] = Line(f"{lines[0].text} {refuted}", lines[0].level)
-    return [*lines[:2], Line(found.steepest[0].sentence)]
+    return [*lines[:2], Line(mapped.steepest[0].sentence)]
 
 
 def subtitle(data: ProbeRecord) -> str:
@@ -175,14 +179,14 @@ def subtitle(data: ProbeRecord) -> str:
     return ", ".join(parts) + "."
 
 
-def numbers(data: ProbeRecord, where: MapRecord | None = None) -> list[dict[str, str]]:
-    """The five numbers at the top: value with its error or bracket, and what it is; where: what renders say of the ends."""
+def numbers(data: ProbeRecord, mapped: MapRecord | None = None) -> list[dict[str, str]]:
+    """The five numbers at the top: "value", with its error or bracket, and "words".  mapped: compares ends with renders."""
     ends, found = data.eigenvalues, []
     lowest = "most negative" if (ends.min.value or 0.0) < 0 else "smallest"
-    seen = {each.curvature > 0: _by_renders(each) for each in (where.steepest if where else [])}
+    rendered = {each.curvature > 0: _by_renders(each) for each in (mapped.steepest if mapped else [])}
     for end, words in ((ends.max, "largest curvature, λ max"), (ends.min, f"{lowest} curvature, λ min")):
-        said = seen.get((end.value or 0.0) > 0, "")
-        found.append({"value": measured(end.value, end.residual), "words": f"{words}, per stored unit²{said}"})
+        compared = rendered.get((end.value or 0.0) > 0, "")
+        found.append({"value": measured(end.value, end.residual), "words": f"{words}, per stored unit²{compared}"})
     found += _steepest_attribute(data)
     if index := data.anisotropy.literal:
         cell = bracketed(None if is_open(index) else index)
@@ -197,7 +201,7 @@ def numbers(data: ProbeRecord, where: MapRecord | None = None) -> list[dict[str,
 
 
 def _by_renders(end: Steepest) -> str:
-    """What renders of several steps say of an end's curvature; empty in older maps."""
+    """Comparison of an end's curvature with renders of several steps; empty in older maps."""
     if end.is_refuted:
         return "; not confirmed by renders"
     if not end.factors:
@@ -206,25 +210,20 @@ def _by_renders(end: Steepest) -> str:
 
 
 def _steepest_attribute(data: ProbeRecord) -> list[dict[str, str]]:
-    """Its step's effect over the next one's, where that is known; else the trace that is the largest number."""
+    """The largest change of the loss by an optimiser's step over the next one, where known; else the largest trace."""
     if steps := largest_steps(data):
-        first, second, ratio = steps
-        words = (
-            f"the change of the loss by a step of the optimiser: {attribute_name(first)} over {attribute_name(second)}"
-        )
+        first, second, ratio = attribute_name(steps[0]), attribute_name(steps[1]), steps[2]
+        words = f"the change of the loss by a step of the optimiser: {first} over {second}"
         return [{"value": f"{ratio:.2g} : 1", "words": words}]
-    traces = {
-        name: trace for name, trace in data.traces.items() if trace.value is not None and math.isfinite(trace.value)
-    }
-    if not traces:
+    if not (values := trace_values(data)):
         return []
-    name, trace = max(traces.items(), key=lambda item: abs(item[1].value or 0.0))
+    name = max(values, key=lambda each: abs(values[each]))
     words = f"trace of {attribute_name(name)}, the largest of five in their own units"
-    return [{"value": measured(trace.value, trace.standard_error), "words": words}]
+    return [{"value": measured(values[name], data.traces[name].standard_error), "words": words}]
 
 
 def map_beside(record: Record[ProbeRecord]) -> MapRecord | None:
-    """The map beside the record, if it was made of the same step of the training."""
+    """The map beside the record, if it is of the same training step."""
     folder = record.folder.parent / MAP
     if not (folder / MapRecord.FILE).is_file():
         return None
@@ -233,16 +232,16 @@ def map_beside(record: Record[ProbeRecord]) -> MapRecord | None:
     return found if same else None
 
 
-def views_in(record: Record[ProbeRecord], found: MapRecord | None) -> list[dict[str, Any]]:
-    """Photograph and render of the training views whose pictures lie in the folder, with the maps of those that were mapped.
+def views_in(record: Record[ProbeRecord], mapped: MapRecord | None) -> list[dict[str, Any]]:
+    """Training views whose pictures lie in the folder: photograph, render and, where there is a map, the mapped ones with it.
 
-    Each has its name and its pictures: what each is in words, a data URI, and the scale of its colours where it is a map.
+    A view has its "name" and its "pictures": "words", "uri" and "legend" (the scale of a map's colours, else empty).
     """
     names, folder = record.data.provenance.views or [], record.folder
     pairs = [(folder / PHOTOGRAPH.format(i), folder / RENDER.format(i)) for i in range(len(names))]
     drawn = [i for i, pair in enumerate(pairs) if all(path.is_file() for path in pair)]
     maps = record.folder.parent / MAP
-    panels = {panel.place: maps / f"{panel.file}.npz" for panel in (found.panels if found else [])}
+    panels = {panel.place: maps / f"{panel.file}.npz" for panel in (mapped.panels if mapped else [])}
     panels = {place: path for place, path in panels.items() if path.is_file() and place in drawn}
     views = []
     for i in sorted(panels) or drawn:
@@ -250,9 +249,9 @@ def views_in(record: Record[ProbeRecord], found: MapRecord | None) -> list[dict[
             {"words": words, "uri": data_uri(path.read_bytes(), "jpeg"), "legend": ""}
             for words, path in zip(("photograph", "render"), pairs[i])
         ]
-        if found and panels:
+        if mapped and panels:
             with np.load(panels[i], allow_pickle=False) as arrays:
-                for shade in (found.shades[found.field], found.shades["error"]):
+                for shade in (mapped.shades[mapped.field], mapped.shades["error"]):
                     coloured = Image.fromarray(shade.palette[arrays[shade.name]])
                     coloured.thumbnail(Image.open(pairs[i][0]).size)
                     uri = picture_uri(coloured, COARSE)
@@ -261,21 +260,24 @@ def views_in(record: Record[ProbeRecord], found: MapRecord | None) -> list[dict[
     return views
 
 
-def where(folder: Path, found: MapRecord | None, said: str) -> list[dict[str, str]]:
-    """Of the map in a folder, by picture: the sentence above it, and the caption beneath; said: what is told already."""
-    if found is None:
+def map_pictures(folder: Path, mapped: MapRecord | None, shown: str) -> list[dict[str, str]]:
+    """Pictures of the map in a folder: "uri", "words", the "text" above and the "caption" below each.
+
+    shown: a sentence that the page has already, which no text repeats.
+    """
+    if mapped is None:
         return []
-    shown = []
-    for end in found.steepest:
-        text = end.rendered if end.sentence == said else f"{end.sentence} {end.rendered}"
-        shown.append((end.file, text, end.sentence, carriers_in_words(end)))
-    fragile, named = "\n".join(found.sentences[len(found.steepest) :]), {end.view for end in found.steepest[:1]}
-    panel = next((panel for panel in found.panels if panel.name in named), found.panels[0] if found.panels else None)
+    rows = []
+    for end in mapped.steepest:
+        text = end.rendered if end.sentence == shown else f"{end.sentence} {end.rendered}"
+        rows.append((end.file, text, end.sentence, carriers_in_words(end)))
+    fragile, named = "\n".join(mapped.sentences[len(mapped.steepest) :]), {end.view for end in mapped.steepest[:1]}
+    panel = next((panel for panel in mapped.panels if panel.name in named), mapped.panels[0] if mapped.panels else None)
     words = f"{panel.name}: maps of its fragility in position, conditioning and opacity. {PIXEL}" if panel else ""
-    shown.append((panel.file.replace("view", "fragility") if panel else "", fragile, words, words))
+    rows.append((panel.file.replace("view", "fragility") if panel else "", fragile, words, words))
     return [
         {"text": text, "caption": caption, "words": words, "uri": picture_uri(path) if path.is_file() else ""}
-        for path, text, words, caption in ((folder / f"{name}.png", *rest) for name, *rest in shown)
+        for path, text, words, caption in ((folder / f"{name}.png", *rest) for name, *rest in rows)
     ]
 
 
@@ -296,7 +298,7 @@ def carriers_in_words(end: Steepest) -> str:
 def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:
     """A picture as a data URI; WebP takes a quarter of the bytes of PNG."""
     content, image = io.BytesIO(), Image.open(picture) if isinstance(picture, Path) else picture
-    image.convert("RGB").save(content, "WEBP", quality=quality, method=QUICK)
+    image.convert("RGB").save(content, "WEBP", quality=quality, method=EFFORT)
     return data_uri(content.getvalue(), "webp")
 
 
@@ -305,9 +307,9 @@ def data_uri(content: bytes, kind: str) -> str:
 
 
 def interactive_surface(record: Record[ProbeRecord]) -> dict[str, Any] | None:
-    """The recorded slice as a surface to turn and zoom, with the quadratic model where known: what plotly.js draws, in JSON.
+    """Data and layout for plotly.js of the recorded slice as a surface, with the quadratic model where known; None without one.
 
-    None without a slice.  The Python half of plotly would take half a second to say the same.
+    Written without plotly's Python package, whose import is slow.
     """
     about = record.data.slice
     if about is None or "slice" not in record.arrays or not about.is_resolved:
@@ -328,8 +330,9 @@ def interactive_surface(record: Record[ProbeRecord]) -> dict[str, Any] | None:
         for name, label, colours, opacity in layers if name in arrays
     ]  # fmt: skip
     steps = [
-        {"title": {"text": f"step along {_escaped(each.name)}"}, "exponentformat": "power"} for each in about.directions
-    ]
+        {"title": {"text": f"step along {html.escape(each.name, quote=False)}"}, "exponentformat": "power"}
+        for each in about.directions
+    ]  # plotly reads some tags in its texts
     change = {"title": {"text": f"change of loss{unit_suffix(exponent)}"}, "range": [low, high]}
     eye = eye_over((loss / 10.0**exponent - low) / (high - low), 1.0)
     camera = {"eye": dict(zip("xyz", eye, strict=True)), "center": {"x": 0, "y": 0, "z": -0.1}}
@@ -351,30 +354,19 @@ def _packed_plotly() -> str:
     return base64.b64encode(gzip.compress(content, PACKED, mtime=0)).decode()
 
 
-def _escaped(text: str) -> str:
-    """plotly reads some tags in its texts; a record's text has none to be read."""
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-
-
-def captions(data: ProbeRecord) -> dict[str, str]:
-    """What each picture draws."""
-    return PICTURES | ({"traces": COMPARED} if shares_per_trace(data) else {})
-
-
 def pictures_in(
     folder: Path, captions: Mapping[str, str], words: Mapping[str, str] | None = None
 ) -> list[dict[str, str]]:
-    """The pictures that were drawn, as data URIs with their captions; words: what they show, where the caption does not say."""
-    drawn = [(name, caption, folder / f"{name}.png") for name, caption in captions.items()]
+    """The pictures NAME.png that lie in a folder: "name", "uri", "caption", and alternative text, by default the caption."""
     return [
         {"name": name, "caption": caption, "words": (words or {}).get(name, caption), "uri": picture_uri(path)}
-        for name, caption, path in drawn
-        if path.is_file()
+        for name, caption in captions.items()
+        if (path := folder / f"{name}.png").is_file()
     ]
 
 
 def shown_numbers(record: Record[ProbeRecord]) -> dict[str, str]:
-    """What the pictures show, in numbers: for those who do not see them."""
+    """Alternative texts of the pictures, by name: the numbers that they show."""
     data, ends = record.data, record.data.eigenvalues
     traces = ", ".join(f"{attribute_name(name)} {quantity(trace.value)}" for name, trace in data.traces.items())
     found = {
@@ -390,7 +382,7 @@ def shown_numbers(record: Record[ProbeRecord]) -> dict[str, str]:
 
 
 def _setting(value: Any, name: str) -> str:
-    """A value of the settings, with its unit."""
+    """A value in the tables of counts and provenance, with its unit."""
     if name == "max_seconds" and value in ("Infinity", math.inf):
         return "no limit"
     unit = {"memory": " GiB", "max_seconds": " s"}.get(name, "")
@@ -398,16 +390,11 @@ def _setting(value: Any, name: str) -> str:
 
 
 def _cell(value: Any) -> str:
-    """A value of the record in a table: counts with separators, numbers with few digits, the rest as it is."""
-    match value:
-        case None:
-            return quantity(None)
-        case bool():
-            return "yes" if value else "no"
-        case int():
-            return f"{value:,}"
-        case float():
-            return quantity(value)
-        case list():
-            return ", ".join(_cell(item) for item in value)
-    return str(value)
+    """A value of the record in a table: counts with separators, numbers with three digits, other values as `str`."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, list):
+        return ", ".join(map(_cell, value))
+    return quantity(value) if value is None or isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""The sections of a record, as typed structures: what each key means, its type, and how it is written and read (`msgspec`).
+"""The sections of a record as typed structures (`msgspec`): meaning and type of every key.
 
 The whole files `probe.json` and `slice.json` are `ProbeRecord` and `SliceRecord` in `analysis.records.records`.  Losses are
 dimensionless; curvatures are loss per squared stored unit, with respect to the stored parameters.
@@ -7,8 +7,8 @@ null (None)   not determined; the `note` beside it says why
 UNSET         the key is absent: not every file has it.  UNSET is false, as None is
 not finite    a float; in the file, which is strict JSON, the text "NaN", "Infinity" or "-Infinity"
 
-Within a version of a format keys are added, never renamed or removed.  Fields with a default are those that older files may
-lack; keys of a file that are no fields are ignored.
+Within a version of a format, keys are added, never renamed or removed.  Fields with a default may be absent from older files;
+keys of a file that are not fields are ignored.
 """
 
 import math
@@ -40,7 +40,7 @@ class Named(Struct, Generic[T]):
 
 
 class Objective(Struct, kw_only=True):
-    """The function whose curvature is measured, beside the training views.
+    """The function whose curvature is measured.
 
     loss: its formula in words.  sizes: (width, height) of each view, px.  value: L at the checkpoint.
     gradient_norm: |dL/dTheta|.  views_error: of value, as for `TraceOf`.
@@ -62,8 +62,8 @@ class TraceOf(Struct, kw_only=True):
     sign: "undetermined" where the interval does not decide it.  dim: parameters of the block.  probes: random vectors; 0 where
     exact.  matvecs: products H v.  reason: why it stopped, one of `landscape.results.StopReason`.
     method: "exact", or "exact, the coupling of pixels sampled with random signs".  note: why value is null, ...
-    views_error: where training views were left out (`Counts.views_of`), the standard error that this adds to value as that of
-    all of them, had they been drawn at random; null where it is not known.
+    views_error: where training views were left out (`Counts.views_of`), the standard error of value as an estimate for all
+    views, as if those measured had been drawn at random; null where not known.
     """
 
     value: Number
@@ -85,7 +85,7 @@ class TraceOf(Struct, kw_only=True):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """low, high; where they are not known, one standard error to either side."""
+        """(low, high); where not known, one standard error to either side of value."""
         if self.low is not None and self.high is not None and math.isfinite(self.high - self.low):
             return self.low, self.high
         value, error = self.value or 0.0, self.standard_error
@@ -106,9 +106,9 @@ class Trace(TraceOf, kw_only=True):
 class LivesOn(Struct, kw_only=True):
     """Localization of an eigenvector (`analysis.measures.localization`).
 
-    attributes: its shares of the squared mass.  participation: over how many Gaussians it is spread.  needles, needles_bare:
-    share of the mass on Gaussians with a condition number above 100, with and without the blur of 0.3 px^2; needle_count,
-    needle_bare_count: how many those are.  heaviest: (index, share) of single Gaussians, the largest share first.
+    attributes: shares of the squared mass |v|^2.  participation: over how many Gaussians it is spread.  needles, needles_bare:
+    share of it on Gaussians with a condition number above 100, with and without the blur of 0.3 px^2; needle_count,
+    needle_bare_count: the number of those.  heaviest: (index, share) of single Gaussians, the largest share first.
     """
 
     attributes: dict[str, float] = {}
@@ -121,11 +121,11 @@ class LivesOn(Struct, kw_only=True):
 
 
 class End(Struct, kw_only=True):
-    """A Ritz value of an operator, signed, and its unit vector v.
+    """A Ritz value of an operator, signed, with its unit Ritz vector v.
 
-    residual: |H v - value v|: a true eigenvalue lies within it.  vector_error: about the sine of the angle between v and the
-    true eigenvector.  reason, note: as for `TraceOf`.  views_error: likewise, of v . H v with this v: another direction may be
-    steeper in the views left out.  without_one: the least and the largest v . H v where one of the views measured is left out.
+    residual: |H v - value v|: an eigenvalue lies within this distance.  vector_error: about the sine of the angle between v and
+    the true eigenvector.  reason, note: as for `TraceOf`.  views_error: likewise, of v . H v at this v; in the views left out
+    another direction may be steeper.  without_one: least and largest v . H v with one of the views measured left out.
     """
 
     value: Number
@@ -138,6 +138,11 @@ class End(Struct, kw_only=True):
 
     def __post_init__(self) -> None:
         _require_error("residual", self.residual)
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether the search for it did not end at a budget."""
+        return not (self.reason or "").endswith("budget")
 
 
 class Eigenvalue(End, kw_only=True):
@@ -160,7 +165,7 @@ class Eigenvalues(Named[Eigenvalue], kw_only=True):
 
 
 class Index(Struct, kw_only=True):
-    """A number derived from others, and its bracket.  value: None where undefined; low, high: None where unbounded."""
+    """An index and its bracket.  value: None where undefined; low, high: None where unbounded."""
 
     value: Number
     low: Number
@@ -184,9 +189,9 @@ INDICES = Anisotropy.__struct_fields__
 class FiniteProbe(Struct, kw_only=True):
     """The second difference (L(+d v) + L(-d v) - 2 L) / d^2 along a direction v, for all steps d of it.
 
-    round_off, truncation: bounds of its errors.  crossed: at which steps the order of the splats or the set of visible ones
-    changed; None where that is not known.  infinitesimal: v.H v.  center_loss, noise: L and the standard deviation of one
-    evaluation's error.  best: index of the step with the least error of those that cross nothing; None without any.
+    round_off, truncation: bounds of its errors.  crossed: whether the order of the splats or the set of visible ones changed,
+    by step; None where not known.  infinitesimal: v . H v.  center_loss, noise: L and the standard deviation of the error of an
+    evaluation.  best: index of the step with the least error among those without a crossing; None without any.
     evaluations: renders of all views.
     """
 
@@ -211,10 +216,11 @@ class FiniteProbe(Struct, kw_only=True):
 
 
 class Rise(Struct, kw_only=True):
-    """Rises of the loss by finite steps along and across the rays, and depth over lateral, with standard errors.
+    """Rises of the loss by finite steps along the rays (depth) and across them (lateral), with standard errors; ratio: depth
+    over lateral.
 
-    pixels: the length of the steps, as what they move a splat by where they are across the ray.  _crossed: the share of the
-    renders with another order of the splats or set of visible ones.
+    pixels: length of the steps: the displacement in the image of a step across the ray.  _crossed: share of the renders in
+    which the order of the splats or the set of visible ones changed.
     """
 
     pixels: float
@@ -236,10 +242,10 @@ class DepthTraces(Struct, kw_only=True):
 
 
 class Depth(Struct, kw_only=True):
-    """The positions along the rays against one direction across them (`analysis.measures.depth`).
+    """Derivatives of the positions along the rays, over those in one direction across them (`analysis.measures.depth`).
 
-    gradient_ratio: of the root mean square gradients.  gradient_median: of the gradients' ratios over `pairs` of a Gaussian
-    and a view.  curvature: the traces.  curvature_ratio: of the mean curvatures.  rises: one for each length of steps.
+    gradient_ratio: of root mean squares over `pairs` of a Gaussian and a view; gradient_median: median of the pairs' ratios.
+    curvature: the traces.  curvature_ratio: of the mean curvatures.  rises: one for each length of steps.
     """
 
     gradient_ratio: Number
@@ -253,9 +259,9 @@ class Depth(Struct, kw_only=True):
 class BlockShare(Struct, kw_only=True):
     """Share of an operator's squared entries within the diagonal blocks of Gaussians (`splat.curvature.scores.shares`).
 
-    coupled: with SSIM's coupling of pixels.  blocks, attributes, diagonal: the share within the 11 x 11 of geometry and the
-    diagonal of SH, within the attributes' blocks of these, and on the diagonal; None where the operator is 0.  norm: squared.
-    relative_error: the standard error of the norm, and of each share, over it.  samples: random vectors.
+    coupled: with SSIM's coupling of pixels.  blocks: share within the 11 x 11 of geometry and the diagonal of SH; attributes:
+    within the attributes' blocks of these; diagonal: on the diagonal; None where the operator is 0.  norm: squared Frobenius
+    norm.  relative_error: relative standard error of the norm and of each share.  samples: random vectors.
     """
 
     operator: Operator
@@ -271,9 +277,9 @@ class BlockShare(Struct, kw_only=True):
 class Family(Struct, kw_only=True):
     """The anisotropy of one diagonal block of one operator (`analysis.measures.families`).
 
-    metric, unit: in which units curvature is compared, and these in words.  block: "all" or an attribute.  split: whether of
-    the split scene.  dim: rows of the block; rank: those without the exact null space.  beyond: how far outside an end that
-    ran out of its budget may lie (`landscape.eigen.pairs.EigenEnds`).  starts, steps: of the density.
+    metric, unit: units in which curvature is compared, by name and in words.  block: "all" or an attribute.  split: whether of
+    the split scene.  dim: rows of the block; rank: dim less the exact null space.  beyond: distance beyond the Ritz values
+    that the spectrum may reach (`landscape.eigen.pairs.EigenEnds`).  starts, steps: of the density.
     """
 
     metric: str
@@ -294,7 +300,7 @@ class Family(Struct, kw_only=True):
 
 
 class Effect(Struct, kw_only=True):
-    """An index of the split scene over that of the trained one: value, low, high, note as for `Index`."""
+    """Ratio of an index of the split scene to that of the trained one: value, low, high, note as for `Index`."""
 
     operator: Operator
     block: str
@@ -308,7 +314,7 @@ class Effect(Struct, kw_only=True):
 class SplitControl(Struct, kw_only=True):
     """Effect of splitting every Gaussian in two (`analysis.measures.split_control`).
 
-    gaussians: after it.  rms, largest, psnr (dB): of the images' change; psnr is None where nothing changed.
+    gaussians: of the split scene.  rms, largest, psnr (dB): change of the images; psnr is None where nothing changed.
     """
 
     gaussians: Count
@@ -341,13 +347,13 @@ class Direction(Struct, kw_only=True):
 class Slice(Struct, kw_only=True):
     """The loss along a line or over a plane through the checkpoint.
 
-    cosine: of the angle between the two directions before the second was put at a right angle.  center_loss: L at the centre,
-    a render of the slice's own.  points, evaluated_points, crossed_points: of the grid, see ARRAYS; evaluations: renders of
-    all views.  tolerance: what was asked of the points that are interpolated, as a share of the range of the evaluated losses;
-    None where all are evaluated.  resolved: whether that was reached; else only evaluated points have a loss.
-    interpolation_error: the bound of the error at every interpolated point (`landscape.slices.interpolation`), as such a share;
-    0 where all points are evaluated, None where there is none.  error_seen: the largest at `holdout_points` random points;
-    share_beyond: with 95% confidence at most this share of the interpolated points is off by more.  reason: as for `Trace`.
+    cosine: of the angle between the two directions before they were orthogonalised.  center_loss: L at the centre, rendered
+    with the slice.  points, evaluated_points, crossed_points: of the grid, see ARRAYS; evaluations: renders of all views.
+    Errors are shares of the range of the evaluated losses.  tolerance: asked of interpolated points; None where all are
+    evaluated.  resolved: whether it was reached; else only evaluated points have a loss.  interpolation_error: bound at every
+    interpolated point (`landscape.slices.interpolation`); 0 where all are evaluated, None where there is no bound.
+    error_seen: the largest at `holdout_points` random points; share_beyond: with 95% confidence at most this share of the
+    interpolated points has a larger error.  reason: as for `Trace`.
     """
 
     directions: Annotated[list[Direction], Meta(min_length=1, max_length=2)]
@@ -369,5 +375,5 @@ class Slice(Struct, kw_only=True):
 
     @property
     def is_resolved(self) -> bool:
-        """Whether every point of the grid has a loss; older files do not say so, and have it."""
+        """Whether every point of the grid has a loss, as in older files, which lack the key."""
         return self.resolved is not False

@@ -1,4 +1,4 @@
-"""A record as tables: of a probe, for the terminal, and of its anisotropy families, for the terminal and the report."""
+"""Tables of a probe's record: all numbers, for the terminal; the anisotropy families, for the terminal and the report."""
 
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,23 +22,24 @@ ENDS = {
     "power_max": "power iteration, max",
     "power_min": "power iteration, min",
 }
-NEEDS_DENSITY = "needs the spectral density, which was left out"  # said of an index
+NEEDS_DENSITY = "needs the spectral density, which was left out"  # note of an index
 OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
 ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
 GAPS, NUMBER, REMARK = 8, 27, 22  # of the probe's table: between columns, widest number in a line, least room for words
 WIDTH = 15  # of a column of the families' table, with which it fits into 80
-NARROW = 0.1  # of the value: a bracket that is written as an error
+NARROW = 0.1  # width of a bracket, over the value, below which it is written as an error
+Row = tuple[str, str, str]
 
 
 def probe_table(data: ProbeRecord, width: int = 80) -> Table:
-    """Traces, eigenvalues, anisotropy, counts and checks, in a width where words wrap and numbers do not."""
+    """Traces, eigenvalues, anisotropy, counts and checks.  Words are wrapped to the width, numbers are not."""
     rows = [
         *_trace_rows(data),
         None,
         *_end_rows(data),
         None,
-        *((name.replace("_", " "), *_index(index)) for name, index in data.anisotropy.items() if _measured(index)),
+        *_index_rows(data),
         None,
         *_depth_rows(data.depth),
         None,
@@ -64,11 +65,8 @@ def probe_table(data: ProbeRecord, width: int = 80) -> Table:
     return table
 
 
-Row = tuple[str, str, str]
-
-
 def wrapped(text: str, width: int) -> str:
-    """Text in lines of this width at most; a number, with its error and pixels, stays in one.
+    """Text in lines of at most this width; a number is not broken from its error or its unit px.
 
     >>> print(wrapped(f"{quantity(8.6e-6, 6e-7)} over {quantity(1.37e-4, 1e-5)}", 22).replace(HARD, " "))
     (8.60 ± 0.60) × 10⁻⁶
@@ -89,15 +87,22 @@ def _trace_rows(data: ProbeRecord) -> Iterator[Row]:
 
 
 def _end_rows(data: ProbeRecord) -> Iterator[Row]:
-    """An end that was not reached is no number."""
+    """Rows of the eigenvalues; one whose search ended at a budget has its value among the words."""
     for name, end in data.eigenvalues.items():
         main, share = max(end.shares.items(), key=lambda item: item[1], default=("no attribute", 0.0))
         value = measured(end.value, end.residual)
         about = f"{share:.0%} {attribute_name(main)}, {end.matvecs} products"
         about += f"{_reason(end.reason)}{_of_views(end.views_error)}"
-        if (end.reason or "").endswith("budget"):
+        if not end.is_reached:
             value, about = UNDETERMINED, f"at {value} so far; {about}"
         yield ENDS[name], value, about
+
+
+def _index_rows(data: ProbeRecord) -> Iterator[Row]:
+    """Rows of the indices, but for those that the record's notes name as left out."""
+    for name, index in data.anisotropy.items():
+        if index.note != NEEDS_DENSITY:
+            yield name.replace("_", " "), *_index(index)
 
 
 def _count_rows(counts: Counts) -> Iterator[Row]:
@@ -112,30 +117,27 @@ def _check_rows(checks: Mapping[str, Check]) -> Iterator[Row]:
         yield "checks passed", f"{len(good)} of {len(checks)}", ", ".join(good)
     for name, check in checks.items():
         if not check.passed:
-            yield f"check: {name.replace('_', ' ')}", quantity(check.value), _outcome(check)
-
-
-def _measured(index: Index) -> bool:
-    return index.note != NEEDS_DENSITY  # the record's notes say that these were left out
+            outcome = "could not run" if check.passed is None else "FAILED"
+            note = f" ({check.note})" if check.note else ""
+            yield (
+                f"check: {name.replace('_', ' ')}",
+                quantity(check.value),
+                f"{outcome}, at most {quantity(check.bound)}{note}",
+            )
 
 
 def _reason(reason: str | None) -> str:
-    """Why it stopped, where that was not because the error asked for was reached."""
+    """Why an estimate stopped, unless it reached its tolerance."""
     return "" if reason in ("tolerance", "exact") else f", {reason}"
 
 
 def _of_views(error: float | UnsetType | None) -> str:
-    """Possible change by views left out, where some were."""
+    """Standard error for the views left out, where some were."""
     return "" if error is UNSET else f", views left out{apart(error)}"
 
 
-def _outcome(check: Check) -> str:
-    outcome = "could not run" if check.passed is None else "FAILED"
-    return f"{outcome}, at most {quantity(check.bound)}{f' ({check.note})' if check.note else ''}"
-
-
 def _depth_rows(depth: Depth | None) -> Iterator[Row]:
-    """Rows of positions along the rays, over a direction across them."""
+    """Rows of the positions' derivatives and rises along the rays, over those in one direction across them."""
     if depth is None:
         return
     median = f"median {quantity(depth.gradient_median)}, {depth.pairs:,} pairs of Gaussian and view"
@@ -156,7 +158,7 @@ def _share_rows(shares: Iterable[BlockShare]) -> Iterator[Row]:
 
 
 def _index(index: Index) -> tuple[str, str]:
-    """Value, and bracket and note; a narrow bracket is written as an error, a value without bracket not at all."""
+    """Value, and its bracket with the note; a value with an open bracket is not written (`bracketed`)."""
     cell = bracketed(index)
     if index.low is None and index.high is None:
         return UNDETERMINED, index.note
@@ -168,7 +170,7 @@ def _index(index: Index) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class Cell:
-    """A number as text, what its bracket leaves open, and a note."""
+    """A number as text, its bracket and a note."""
 
     value: str
     bracket: str = ""
@@ -179,8 +181,8 @@ BLANK = (Cell(""), Cell(""))
 
 
 @dataclass(frozen=True)
-class Line:
-    """One family, or what the split does to it: ends, two cells, and indices, one of each in INDICES."""
+class FamilyLine:
+    """One family, or the factors by which the split changes it.  ends: largest, smallest; indices: in the order of INDICES."""
 
     operator: str
     block: str
@@ -191,8 +193,8 @@ class Line:
     indices: tuple[Cell, ...]
 
 
-def family_lines(data: ProbeRecord) -> list[Line]:
-    """Lines of every operator and block: the families, the split scene's beneath, and what the split changes."""
+def family_lines(data: ProbeRecord) -> list[FamilyLine]:
+    """Lines of every operator and block: the trained scene's, the split scene's, and the factors between them."""
     rows, control = data.families or [], data.split_control
     lines = []
     for row in (row for row in rows if not row.split):
@@ -207,7 +209,7 @@ def family_lines(data: ProbeRecord) -> list[Line]:
 
 
 def family_table(data: ProbeRecord) -> Table:
-    """The indices of the lines, brackets beneath the values, within 80 columns: without saddle, which is -literal."""
+    """The indices of all lines, brackets below the values, within 80 columns; without saddle, which is -literal."""
     title = escape(f"Anisotropy by attribute ({data.families[0].unit})") if data.families else None
     look: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False, "show_edge": False}
     table = Table(title=title, caption=CAPTION, **look)
@@ -228,7 +230,7 @@ def family_table(data: ProbeRecord) -> Table:
 
 
 def _folded(text: str, width: int = WIDTH) -> str:
-    """Text in two lines where it is too wide for a column.
+    """Text, broken in two at ± or … where it is wider than a column.
 
     >>> _folded("7.45 × 10⁻⁴ … 1.02 × 10⁴"), _folded("34.1 … 120")
     ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
@@ -237,7 +239,7 @@ def _folded(text: str, width: int = WIDTH) -> str:
 
 
 def bracketed(index: Index | Effect | None) -> Cell:
-    """An index as text: a narrow bracket as an error, one without upper end as the bound that it is, a wide one alone.
+    """An index as text: with a narrow bracket as its error; the bound alone of an open bracket; a wide bracket alone.
 
     >>> bracketed(Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")).value
     '≥ 34.2'
@@ -264,18 +266,18 @@ def factor(effect: Effect | None) -> Cell:
     return cell if cell.value == UNDETERMINED else replace(cell, value=f"× {cell.value}")
 
 
-def _line(row: Family, several: bool) -> Line:
+def _line(row: Family, several: bool) -> FamilyLine:
     ends = _end(row.lambda_max, row.beyond, 1), _end(row.lambda_min, row.beyond, -1)
     indices = tuple(bracketed(getattr(row.indices, name) or None) for name in INDICES)
     scene = "" if not several else "split" if row.split else "trained"
     operator, block = OPERATOR_NAMES[row.operator], attribute_name(row.block)
-    return Line(operator, block, scene, f"{row.gaussians:,}", f"{row.rank:,}", ends, indices)
+    return FamilyLine(operator, block, scene, f"{row.gaussians:,}", f"{row.rank:,}", ends, indices)
 
 
 def _end(end: End, beyond: Number, outwards: int) -> Cell:
-    """An end of the spectrum; of one that the budget did not reach, between what it lies.  outwards: 1 for the largest."""
+    """An end of the spectrum, or the bounds of one whose search ran out of its budget.  outwards: 1 of the largest, else -1."""
     value, residual, reason = end.value, end.residual, end.reason or ""
-    if not reason.endswith("budget") or value is None or residual is None:
+    if end.is_reached or value is None or residual is None:
         return Cell(measured(value, residual), "", reason)
     inner = quantity(value - outwards * residual)
     if beyond is None:

@@ -1,4 +1,4 @@
-"""`landscape slice`: one checkpoint in, its loss along a line or over a plane out, as a record with pictures.
+"""`landscape slice`: the loss of a checkpoint along a line or over a plane, as a record with pictures.
 
     load            the checkpoint, its scene, the other checkpoints of a line or a plane
     linearise       derivatives of every view
@@ -6,9 +6,8 @@
     slice           renders in parallel; of a plane where needed, interpolated elsewhere (`landscape.slices.refinement`)
     finite steps    along a line: second differences at steps over four decades, beside the infinitesimal curvature
 
-What is found on the way is kept in `.NAME.unfinished` beside the record, from which the same command continues, whatever
-ended this one; the directory goes when the record is complete.  A line moves all Gaussians, also those in sight at one of its
-ends only.
+Eigenvectors and renders are kept in `.NAME.unfinished` beside the record until it is complete: after any interruption the same
+command continues from them.  A line moves all Gaussians, also those that are in sight at one of its ends only.
 """
 
 import io
@@ -84,8 +83,8 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
         checkpoint.training.move(device)
         others = [_other_end(checkpoint, path) for path in options.others]
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
-        expected_peak(objective)  # which may be too much
-    # a folder that is being written by another command, or cannot be, is noticed before anything is rendered
+        expected_peak(objective)  # raises MemoryError where it cannot fit
+    # the folder is opened first, so that one that cannot be written is refused before anything is rendered
     with record_folder(out, SliceRecord.FILE) as folder, stages, telling_needs(objective):
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
@@ -100,7 +99,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         made.other = ", ".join(map(str, options.others)) or None
         data = slice_record(found, objective, notes + checkpoint.assumptions, made)
-        objective.release()  # processes that draw take memory too
+        objective.release()  # for the memory of the processes that draw
         write_with_pictures(folder, data, slice_arrays(found), stages, start)
     shutil.rmtree(unfinished, ignore_errors=True)
     _conclude(data, out)
@@ -108,7 +107,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
 
 
 def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
-    """Settings as asked for; a GPU is full with one render."""
+    """Settings of the slice; by default a thread for each render on a CPU, one render at a time on a GPU."""
     most = torch.get_num_threads() if device.type == "cpu" else 1
     workers = most if options.workers is None else options.workers
     if options.all_points:
@@ -126,7 +125,7 @@ def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> Slic
 
 
 def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
-    """The other checkpoint's parameters, with its quaternions near those here."""
+    """Parameters of the other checkpoint, with the sign of each quaternion that is nearer to the first one's."""
     here = checkpoint.training.gaussians
     there = read_splats(path).gaussians if is_foreign(path) else load_checkpoint(path).training.gaussians
     if (len(here), here.sh_degree) != (len(there), there.sh_degree):
@@ -145,7 +144,7 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
 
 
 def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list[str]) -> list[Tensor]:
-    """Eigenvectors of an interrupted run and of the probe.  notes: is told which of them cannot be read."""
+    """Eigenvectors of an interrupted run and of the probe.  notes: gets a sentence on those that cannot be read."""
     kept, found = unfinished / "eigenvectors.npy", []
     if kept.is_file():
         try:
@@ -171,7 +170,7 @@ def _measure(
     stages: Stages,
     population: int | None,
 ) -> Found:
-    """population: training views, where the objective has fewer."""
+    """Run the stages after `load`.  population: number of training views, where the objective has fewer."""
     center = objective.active.flat
     seed = torch.Generator(center.device).manual_seed(options.seed)
     generators = {name: spawn(seed) for name in ("eigenvectors", "random", "holdout")}
@@ -180,7 +179,8 @@ def _measure(
         gradient = objective.gradient
         report(1, 1, f"{len(objective.views)} views")
     operator = CountingOperator(SceneHessian(objective))
-    true = CountingOperator(SceneHessian(objective, keep_null=True))  # H itself: a line may lead anywhere
+    hessian = SceneHessian(objective, keep_null=True)  # a line may have components in the null space
+    true = CountingOperator(hessian)
     with stages.stage("directions") as report:
         exact = find_directions(shape, objective, operator, others, known, generators, report)
         _keep_eigenvectors(exact, unfinished)
@@ -205,15 +205,13 @@ def _measure(
         with stages.stage("finite steps") as report:
             steps = [reach * step for step in DECADES]
             probe = finite_probe(_evaluation(objective, 1), center, vectors[:, 0], true, steps, report)
-    left_out = None
-    if population is not None:
-        left_out = LeftOut(population, SceneHessian(objective, keep_null=True).by_view(vectors))
+    left_out = None if population is None else LeftOut(population, hessian.by_view(vectors))
     matvecs = operator.matvecs + true.matvecs
     return Found(found, probe, directions, vectors, cosine(exact), loss_scale, matvecs, left_out)
 
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:
-    """Keep eigenvectors for the run that continues this one, should it be killed."""
+    """Write the eigenvectors for a run that continues this one."""
     vectors = [direction.vector.cpu().numpy() for direction in directions if direction.kind == "eigenvectors"]
     if not vectors:
         return
@@ -224,7 +222,7 @@ def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> Non
 
 
 def _evaluation(objective: SceneObjective, workers: int) -> Loss:
-    """`evaluation`, with words for steps that lead too far."""
+    """`evaluation`, whose InputError says that the step is too long."""
     inner = evaluation(objective, workers)
 
     def evaluate(flat: Tensor) -> Evaluation:
@@ -237,7 +235,7 @@ def _evaluation(objective: SceneObjective, workers: int) -> Loss:
 
 
 def _conclude(data: SliceRecord, out: Path) -> None:
-    """The curvatures, how well the slice is known, and the files to open."""
+    """Print the curvatures, the accuracy of the slice, and its files."""
     for direction in data.slice.directions:
         curvature = measured(direction.curvature, direction.residual or 0.0) + apart(direction.views_error)
         text = f"{direction.name}: curvature {curvature}, slope {quantity(direction.slope or 0.0)}"
@@ -253,7 +251,7 @@ def _conclude(data: SliceRecord, out: Path) -> None:
 
 
 def _finite_curvature(probe: FiniteProbe) -> str:
-    """The range of the curvatures at the steps where round-off does not hide them."""
+    """Sentence on the range of the curvatures at the steps where round-off does not hide them."""
     sure, steps = np.array(resolved(probe)), np.array(probe.steps)
     if not sure.any():
         return f"at finite steps: round-off hides the curvature at all {len(sure)} steps"

@@ -1,19 +1,20 @@
-"""`landscape train`: a run folder that appears at once, a progress bar, checkpoints, scores of the held-out views.
+"""`landscape train`: train a scene into a run folder, with checkpoints, and score its held-out views.
 
-RUN/checkpoint.pt   the latest checkpoint, see `splat/training/checkpoint.py`; written at the start, every so many steps, on
-                    Ctrl-C and at the end
-RUN/step-N/checkpoint.pt    with --keep-checkpoints: those after step N that stay, each in a folder of its own, as a probe
-                    of it writes there
-RUN/train.csv       how it goes, see `analysis/train/progress.py`
-RUN/seconds.json    how long that took, see `analysis/train/training_time.py`
-RUN/history.csv     what the method noted along the way, a row each with its "step"; where there is any
-RUN/trajectory.csv, RUN/start/checkpoint.pt     with --probe-every: the landscape along the way, see
-`analysis/train/trajectory.py`
-RUN/test/           the held-out views as rendered at the end, see `analysis/train/scores.py`
-RUN/metrics.json    {"step", "method", "protocol", "gaussians", "train": scores, "test": scores or null, "seconds",
-                    "provenance"}, where scores are
-                    {"psnr", "ssim", "lpips", "masked", "views": {NAME: {"psnr", "ssim", "lpips"}}}, psnr in dB;
-                    "Infinity" for a perfect image; lpips null where it cannot be computed; masked: inside masks only
+    RUN/checkpoint.pt           the latest checkpoint (`splat/training/checkpoint.py`), written at the start, every
+                                --checkpoint-every steps, on Ctrl-C and at the end
+    RUN/step-N/checkpoint.pt    with --keep-checkpoints: the latest ones, by step; a probe of one writes beside it
+    RUN/train.csv               progress (`analysis/train/progress.py`)
+    RUN/seconds.json            time of the steps (`analysis/train/training_time.py`)
+    RUN/history.csv             notes of the training method, a row each with its "step"; absent without any
+    RUN/trajectory.csv, RUN/start/checkpoint.pt     with --probe-every: the landscape during the training
+                                (`analysis/train/trajectory.py`)
+    RUN/test/                   renders of the held-out views at the end (`analysis/train/scores.py`)
+    RUN/metrics.json            {"step", "method", "protocol", "gaussians", "train": scores, "test": scores or null, "seconds",
+                                "provenance"}, where scores are {"psnr", "ssim", "lpips", "masked", "views": {NAME: {"psnr",
+                                "ssim", "lpips"}}}: psnr in dB, "Infinity" for a perfect image; lpips null where it cannot be
+                                computed; masked: inside masks only
+
+The run folder appears at once, with its first checkpoint.
 """
 
 import os
@@ -60,7 +61,7 @@ from splat.training.state import TrainConfig, Training
 
 HISTORY, KEPT = "history.csv", "step-{}"
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-OPTIONS = {  # settings of the training that have an option of their own
+OPTIONS = {  # settings of the training that have an option besides --set
     "iterations": "iterations",
     "seed": "seed",
     "sh_degree": "sh_degree",
@@ -75,7 +76,7 @@ AGAIN = "repeat its command with --resume, or choose another --out"
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A training with its scene, its views and its folder.  keep: checkpoints that stay beside the latest."""
+    """A training with its scene, its views and its folder.  keep: number of checkpoints that are kept besides the latest."""
 
     out: Path
     training: Training
@@ -86,9 +87,9 @@ class Run:
     keep: int | Literal["all"] = 0
 
     def create(self, *, keep_start: bool) -> None:
-        """Make the folder with its first checkpoint appear at once.  keep_start: with a copy that stays."""
+        """Create the folder with its first checkpoint, atomically.  keep_start: with a copy in START."""
         partial = self.out.absolute().with_name(f".{self.out.name}.partial")
-        shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed: the lock is ours
+        shutil.rmtree(partial, ignore_errors=True)  # of a killed run: no other has the lock
         partial.mkdir()
         try:
             save_checkpoint(partial / CHECKPOINT, self.training, self.reference)
@@ -100,7 +101,7 @@ class Run:
             raise
 
     def save(self, spent: TrainingTime, *, stays: bool) -> None:
-        """Write the checkpoint and what belongs to it.  stays: also as one of those that are kept; the oldest goes."""
+        """Write the checkpoint, time and history.  stays: also as a kept checkpoint; the oldest beyond `keep` are removed."""
         if stays and self.keep:
             self._save_within(self.out / KEPT.format(self.training.step))
         save_checkpoint(self.out / CHECKPOINT, self.training, self.reference)
@@ -114,7 +115,7 @@ class Run:
             kept = sorted(int(step) for step in steps if step.isdigit())
             for step in kept[: max(len(kept) - self.keep, 0)]:
                 (folder := self.out / KEPT.format(step)).joinpath(CHECKPOINT).unlink()
-                if not any(folder.iterdir()):  # else it holds somebody's probe
+                if not any(folder.iterdir()):  # a probe of the checkpoint may lie there
                     folder.rmdir()
 
     def _save_within(self, folder: Path) -> None:
@@ -147,10 +148,9 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         training = resumed(out / CHECKPOINT, config, reference)
     else:
         generator = torch.Generator().manual_seed(config.seed)
-        start = given
-        if start is None:
-            start = initial_gaussians(scene, views, 0, generator=generator, source=reference.start)
-        training = Training.start(start, scene.extent(split.train), config)
+        if given is None:
+            given = initial_gaussians(scene, views, 0, generator=generator, source=reference.start)
+        training = Training.start(given, scene.extent(split.train), config)
     training.move(device)
     prepare(training, views)  # refuses what cannot be trained before there is a folder
     run = Run(out, training, scene, views, held_out, reference, options.keep_checkpoints)
@@ -158,7 +158,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         out.parent.mkdir(parents=True, exist_ok=True)
     with locked(beside(out), f"no other training in {out}"):
         if not options.resume:
-            _require_run(out, resume=False)  # another may have been faster
+            _require_run(out, resume=False)  # another process may have created it before the lock was taken
             run.create(keep_start=along is not None)
         return _run(run, options, command, along)
 
@@ -183,7 +183,7 @@ def _run(run: Run, options: TrainOptions, command: Sequence[str], along: Traject
 
 
 def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig, SceneReference]:
-    """Plan of a training from its options, before any image is read.  ValueError or FileNotFoundError where they are wrong."""
+    """Plan of a training from its options; reads no image.  Raises ValueError or FileNotFoundError where they are wrong."""
     colour, preset = COLOURS.get(options.background or "scene"), presets(options.method, options.protocol)
     scene = load_scene(
         options.scene, options.images, options.downscale, colour, options.masks, options.depths,
@@ -207,12 +207,13 @@ def _split(options: TrainOptions, scene: Scene) -> Split:
 
 
 def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
-    """The settings asked for, with the schedule of the method scaled to the length, but for what --set gives."""
+    """The settings, with the method's schedule scaled to the number of steps, except for those given by --set."""
     config = _asked(options, scene)
     return config.method.scaled(config, [key.removeprefix("method.") for key in assignments(options.set)])
 
 
 def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
+    """The settings as given: options over --set over the protocol's presets over defaults."""
     red, green, blue = scene.background.tolist()
     if options.method not in METHODS:
         meant = did_you_mean(options.method, METHODS)
@@ -229,21 +230,20 @@ def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
         protocol=options.protocol,
     )
     changes = assignments(options.set)
-    for key, name in OPTIONS.items():
-        given = getattr(options, name)
-        if key in changes and given != getattr(TrainOptions, name):
+    given = {key: name for key, name in OPTIONS.items() if getattr(options, name) != getattr(TrainOptions, name)}
+    for key, name in given.items():
+        if key in changes:
             raise InputError(
                 f"expected one value for {key}, got --set {key}={changes[key]} beside the option --{name.replace('_', '-')}, "
-                f"which is {given}; leave one out"
+                f"which is {getattr(options, name)}; leave one out"
             )
-    given = {key for key, name in OPTIONS.items() if getattr(options, name) != getattr(TrainOptions, name)}
     preset = presets(options.method, options.protocol)
-    beneath = {key: value for key, value in preset.items() if key not in given | {"start"}}
+    beneath = {key: value for key, value in preset.items() if key not in given and key != "start"}
     return overridden(config, beneath | changes)
 
 
 def _require_run(out: Path, resume: bool) -> None:
-    """The folder must exist for a run to resume, and must not for a new one."""
+    """Raise FileNotFoundError or FileExistsError unless a run to resume exists, or a new one does not."""
     if resume and not (out / CHECKPOINT).is_file():
         raise FileNotFoundError(f"expected a run to resume in {out}, found no {CHECKPOINT} there; leave out --resume")
     if not resume and out.exists():
@@ -253,8 +253,7 @@ def _require_run(out: Path, resume: bool) -> None:
 
 
 def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: str = AGAIN) -> Training:
-    """The training of a checkpoint, which must have been started with the same settings on the same views.  remedy: what a
-    refusal advises."""
+    """The training of a checkpoint.  Raises InputError, with this remedy, unless it has the same settings and views."""
     loaded = load_checkpoint(path)
 
     def settings(of: TrainConfig, scene: SceneReference) -> dict[str, Any]:
@@ -272,7 +271,7 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: 
 
 
 def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, console: Console) -> int:
-    """Train to the end, with checkpoints; the exit code where a signal ended it, after a checkpoint."""
+    """Train to the end, with checkpoints; returns 0, or the exit code of the signal that ended it before."""
     training, spent = run.training, TrainingTime.read(run.out)
     total = training.config.iterations
     progress = TrainingProgress(run.out, training, run.views[0], options.log_every, console, options.tensorboard)

@@ -1,34 +1,31 @@
-"""The landscape along a training: at every so many steps the traces, both ends of the spectrum, and the anisotropy indices.
+"""The landscape during a training: traces, both ends of the spectrum and anisotropy indices, every --probe-every steps.
 
-RUN/trajectory.csv            a row for each record, rewritten whole after it (below)
-RUN/start/checkpoint.pt       where the training began, so that its landscape can be looked at too
+    RUN/trajectory.csv         a row for each record, rewritten whole after it (below)
+    RUN/start/checkpoint.pt    the start of the training, for a probe
 
 The operator is the exact Hessian of the training loss over all training views (`splat.curvature.objective`).  Traces are exact
-on a CPU, from every Gaussian's own block, and sampled on a GPU.  Lanczos begins at the directions of single Gaussians
-(`splat.curvature.block_eigenvectors`), as a probe does: from the last record's eigenvectors it may take the neighbour of an end
-for it.  Records draw from generators of their own, seeded by the run's seed and the step: they change no bit of the training,
-and do not depend on each other.
+on a CPU, from the diagonal block of every Gaussian, and sampled on a GPU.  Lanczos starts from eigenvectors of these blocks
+(`splat.curvature.block_eigenvectors`), as in a probe; from the last record's eigenvectors it may converge to the neighbour of
+an end.  Every record has a generator seeded by the run's seed and the step, so that records change no bit of the training and
+do not depend on each other.
 
-Time.  The first record, before the first step, and the last are always made.  Those between may take, with what these two took
-and the last will take at least, `share` of the seconds that the steps have taken so far; what one does not use is left to later
-ones.  A record is whole where that is expected to fit, else coarse, else it is skipped: along a training that leaves little
-time they become coarser and then thinner.  What a record will take is judged by those before it, and at first by the time that
-a gradient takes.  A record's numbers depend on the seed alone; with share = inf every one is whole.
+Time.  The first record, before the first step, and the last are always made.  All records together, with the least that the
+last will take, may take `share` of the seconds of the steps so far; what one record does not use is left to later ones.  A
+record is whole where that is expected to fit, else coarse, else skipped.  Its time is expected from the last records, at first
+from that of a gradient.  A record's numbers depend on the seed alone; with share = inf every record is whole.
 
 Columns:
 
-step, gaussians        steps made, and the Gaussians after them
-state, note            "whole"; "coarse": traces from a few samples, ends to 10% as far as COARSE_MATVECS products reach, no
-                       density; "skipped": nothing measured, the note says why; older files: "cut", time ended it early
-seconds, time_share    that the record took; all records so far over the training's steps so far
-visible_gaussians, parameters    Gaussians in sight, and active parameters
-matvecs                products H v of the record
-trace_A                of each attribute's block, with _error (standard error), _low, _high (95%), _dim and
-_reason
-lambda_max, lambda_min with _error (residual) and _reason (why it ended)
-literal, saddle, share, effective_rank, mass_quantile    the indices (`landscape.spectrum.anisotropy`), with _low and
-_high; the last
-                       three of whole records, which have a spectral density
+    step, gaussians        steps done, and Gaussians after them
+    state, note            "whole"; "coarse": traces from a few samples, ends to 10% or COARSE_MATVECS products, no density;
+                           "skipped": nothing measured, for the reason in the note; "cut" (older files): ended early by time
+    seconds, time_share    of the record; of all records so far over those of the steps so far
+    visible_gaussians, parameters    Gaussians in sight, and active parameters
+    matvecs                products H v of the record
+    trace_A                of each attribute's block, with _error (standard error), _low, _high (95%), _dim and _reason
+    lambda_max, lambda_min    with _error (residual) and _reason (why the search ended)
+    literal, saddle, share, effective_rank, mass_quantile    indices (`landscape.spectrum.anisotropy`), with _low and _high; the
+                           last three of whole records, which have a spectral density
 """
 
 from collections.abc import Sequence
@@ -74,7 +71,7 @@ Row = dict[str, Any]
 Level = Literal["coarse", "whole"]
 FEWEST_OF_DENSITY = 16  # products
 COARSE_MATVECS = 24  # products of a coarse record's search for the ends
-# renders with their gradients, for each view, that a record takes (measured on 8,000 Gaussians)
+# cost of a record, in gradients of all views
 TYPICAL = {"coarse": 20.0, "whole": 64.0}
 COLUMNS = (
     "step", "gaussians", "state", "note", "seconds", "time_share", "visible_gaussians", "parameters", "matvecs",
@@ -86,10 +83,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class TrajectorySettings:
-    """every: steps between records; share: of the time of the steps that the records may take, inf for no limit.
-
-    traces: where they are sampled.
-    """
+    """every: steps between records.  share: of the steps' time that records may take, inf for no limit.  traces: if sampled."""
 
     every: int
     share: float = 0.1
@@ -119,7 +113,7 @@ class Found:
 
 
 class Trajectory:
-    """The records of one run, beside its training.  Reads those that an interrupted run has left, up to the training's step."""
+    """The records of one run.  Reads those of an interrupted run, up to the training's step."""
 
     def __init__(self, run: Path, training: Training, views: Sequence[View], settings: TrajectorySettings) -> None:
         self.run, self.training, self.views, self.settings = run, training, views, settings
@@ -128,12 +122,12 @@ class Trajectory:
         self.pace = _compile(training, views)
 
     def before_steps(self) -> None:
-        """Record the start, whole where half of what the records may take is expected to do."""
+        """Record the start, whole where it is expected to take at most half of all records' time."""
         if self.training.step == 0 and not self.rows:
             self._record(self.settings.share * self.pace * self.training.config.iterations / 2, 0.0)
 
     def after_step(self, trained: float) -> None:
-        """Record where it is time to.  trained: seconds that the steps so far took."""
+        """Record every so many steps and after the last.  trained: seconds of the steps so far."""
         step, last = self.training.step, self.training.config.iterations
         if step % self.settings.every and step != last:
             return
@@ -153,14 +147,14 @@ class Trajectory:
             start = perf_counter()
             try:
                 row |= self._measured(level)
-            except InputError as error:  # such as no Gaussian in sight: the training may still find its way
+            except InputError as error:  # such as no Gaussian in sight: the training may recover
                 row["note"] = str(error)
             row["seconds"] = perf_counter() - start
             if row["state"] == level:
                 self.taken[level] = row["seconds"], len(self.training.gaussians)
         row["time_share"] = (spent + row["seconds"]) / trained if trained else None
         self.rows.append(row)
-        # as objects: a whole number stays one beside a row that has none, as it does in rows read again
+        # dtype object keeps integers in a column with gaps, as they are in rows that were read
         table = pd.DataFrame(self.rows, columns=COLUMNS, dtype=object)
         write_atomically(self.run / RECORDS, table.to_csv(index=False).encode())
 
@@ -177,7 +171,7 @@ class Trajectory:
         return f"of {len(self.rows)} records of the landscape, {said} ({why}){remedy}"
 
     def _expected(self, level: Level) -> float:
-        """Seconds that a record takes: by the last ones, or by the time of a step and a view."""
+        """Expected seconds of a record: from the last ones, else from the time of a step."""
         if isinf(self.settings.share):
             return 0.0
         for known in (level, *TYPICAL):
@@ -249,7 +243,7 @@ def _columns(found: Found) -> Row:
 
 
 def _read_rows(path: Path, step: int) -> list[Row]:
-    """Rows up to a step, as text, which is written back to the same bits."""
+    """Rows up to a step, as text, so that they are written again unchanged."""
     if not path.is_file():
         return []
     table, text = read_trajectory(path), pd.read_csv(path, dtype=str, na_filter=False)
@@ -259,12 +253,12 @@ def _read_rows(path: Path, step: int) -> list[Row]:
 
 
 def _compile(training: Training, views: Sequence[View]) -> float:
-    """Compile the kernels of a record, which would count as its time, on a few Gaussians; seconds of a view's gradient."""
+    """Compile a record's kernels, on a few Gaussians, outside its measured time; returns seconds of a view's gradient."""
     objective = training.config.objective(training.gaussians, views)
     few = training.config.objective(training.gaussians.select(objective.mask.nonzero()[:8, 0]), views)
     least = TrajectorySettings(1, eigen=EigenSettings(max_matvecs=10), density_matvecs=FEWEST_OF_DENSITY)
     for level in get_args(Level):
         measure(few, torch.Generator(training.gaussians.flat.device).manual_seed(0), least, level)
     start = perf_counter()
-    objective.gradient  # noqa: B018 (its time is wanted)
+    objective.gradient  # noqa: B018 (computed to be timed)
     return (perf_counter() - start) / len(views)

@@ -3,7 +3,7 @@
 The rows of `basis` are an orthonormal Q, and T = Q^T H Q is stored as a full matrix, as a restart fills it.  When the memory
 for basis vectors is full, the Ritz vectors (`ritz`) next to both ends are kept and the recurrence goes on from them.  The
 residual r_i = H v_i - lambda_i v_i follows from the recurrence without a product: r_i = N^T B s_i with the next rows N of the
-basis, their coupling B to the newest rows, and the coordinates s_i of v_i in the newest rows.
+basis, the coupling B of N to the newest rows of the basis, and the coordinates s_i of v_i in these.
 
 **Noise from symmetry.**  H is symmetric, so components q_i . H q_j of a new product are known from earlier ones.  They differ
 by q_i . e_j - e_i . q_j, where e is the noise of a product: round-off, or any other error.  A recurrence starts at a random
@@ -37,15 +37,15 @@ from landscape.results import StopReason
 
 KEEP = 0.6  # share of the basis that a restart keeps
 MARGIN = 4.0  # the noise along wanted vectors may exceed the mean noise by this factor
-PAIRS = 10  # components known from symmetry that an estimate of the noise needs
+FEWEST_PREDICTIONS = 10  # components known from symmetry, for an estimate of the noise
 
 
 class Krylov:
     """The basis: orthonormal rows 0..size with known T = Q^T H Q, and `width` next rows, to which H is applied next.
 
-    coupling: B.  scale: largest length of a product.  foreseen: components of the next products known from symmetry; pairs,
-    surprise: the number of such components so far, and the sum of the squares of their differences.  noise: of a product,
-    measured; nan before.  first_cycle: steps before the first restart.  random_share: length of the random part of the start.
+    coupling: B.  scale: largest length of a product.  predicted: components of the next products known from symmetry;
+    predictions, mismatch: number of such components so far, and the norm of all their differences.  noise: of a product, as
+    measured, nan before.  first_cycle: steps before the first restart.  random_share: length of the random part of the start.
     """
 
     def __init__(
@@ -65,8 +65,8 @@ class Krylov:
             first[:, 0] = _mixed(start, first[:, 0], settings.noise)
             self.random_share = settings.noise / (1 + settings.noise)
         self.append(first.T.contiguous())
-        self.foreseen = torch.zeros(0, self.width, dtype=torch.float64)
-        self.pairs, self.surprise = 0, 0.0
+        self.predicted = torch.zeros(0, self.width, dtype=torch.float64)
+        self.predictions, self.mismatch = 0, 0.0
 
     def expand(self, near_noise: bool) -> None:
         """Apply H to the next rows.  near_noise: also measure the noise, unless it is known."""
@@ -76,16 +76,16 @@ class Krylov:
         require_finite(self.operator, all(map(isfinite, lengths)))
         self.scale = max(self.scale if old else 0.0, *lengths)
         components = orthogonalise(W, self.basis[:new])
-        self.surprise = hypot(self.surprise, norm(components[:old] - self.foreseen))
-        self.pairs += self.foreseen.numel()
+        self.mismatch = hypot(self.mismatch, norm(components[:old] - self.predicted))
+        self.predictions += self.predicted.numel()
         self.project(components)
         self.coupling = self.append(W)
-        self.foreseen = torch.zeros(new, self.width, dtype=torch.float64)
-        self.foreseen[old:] = self.coupling.T
+        self.predicted = torch.zeros(new, self.width, dtype=torch.float64)
+        self.predicted[old:] = self.coupling.T
         self.first_cycle += not self.restarted
 
     def ritz(self) -> Ritz:
-        """All Ritz pairs.  Indices of wanted ones: at the upper end descending, at the lower end ascending."""
+        """All Ritz pairs, with the indices of the wanted ones: descending at the upper end, ascending at the lower end."""
         m, settings = self.size, self.settings
         values, coordinates = torch.linalg.eigh(self.T[:m, :m])
         residuals = torch.linalg.vector_norm(self.coupling @ coordinates[m - self.coupling.shape[1] :], dim=0)
@@ -93,10 +93,10 @@ class Krylov:
         return Ritz(values, coordinates, residuals, descending, list(range(settings.smallest)))
 
     def exhausted(self, ritz: Ritz, goal: Goal) -> bool:
-        """Whether the basis spans (or did before) an invariant subspace, so that later rows are random vectors.
+        """Whether the basis spans, or has spanned, an invariant subspace, so that later rows are random vectors.
 
-        All residuals are then small even where another eigenvector of a wanted value is missing.  So a run ends only when one
-        more row has changed no wanted value.
+        All residuals are then small, even if another eigenvector of a wanted value is missing.  So a run ends only after a
+        further row has changed no wanted value.
         """
         # |B| bounds every residual
         self._exhausted |= norm(self.coupling) <= float(goal.of(ritz.values[ritz.wanted]).max())
@@ -105,9 +105,8 @@ class Krylov:
     def make_room(self, ritz: Ritz) -> None:
         """Restart if the memory has no room for the next rows.
 
-        The share KEEP of the Ritz vectors stays, and at least the wanted ones.  Further ones come evenly from both ends: those
-        next to an end that has not converged help where the spectrum is dense there, the others where it reaches far on the
-        other side.
+        The share KEEP of the Ritz vectors stays, at least the wanted ones; the others in equal numbers from both ends.  Those
+        near an end help it converge where the spectrum is dense there, those at the other end where it reaches far.
         """
         if self.size + self.width <= self.capacity:
             return
@@ -120,13 +119,17 @@ class Krylov:
         self.basis[keep : keep + self.width] = following
         self.T.zero_()
         self.T[:keep, :keep] = torch.diag(ritz.values[kept])
-        self.foreseen = combination[:, self.size - self.coupling.shape[1] :] @ self.coupling.T
+        self.predicted = combination[:, self.size - self.coupling.shape[1] :] @ self.coupling.T
         self.size, self.restarted = keep, True
 
     @property
     def seen_noise(self) -> float:
-        """The noise of a product from symmetry; nan while there are fewer than PAIRS known components."""
-        return self.surprise * sqrt(self.operator.dim / (2 * self.pairs)) if self.pairs >= PAIRS else nan
+        """The noise of a product from symmetry; nan with fewer than FEWEST_PREDICTIONS components."""
+        return (
+            self.mismatch * sqrt(self.operator.dim / (2 * self.predictions))
+            if self.predictions >= FEWEST_PREDICTIONS
+            else nan
+        )
 
     def floor(self, ritz: Ritz) -> float:
         """The smallest residual that the measured noise of a product permits."""
@@ -137,7 +140,7 @@ class Krylov:
         return torch.finfo(self.basis.dtype).eps * float(ritz.values.abs().max())
 
     def products(self, near_noise: bool) -> Float[Tensor, "width n"]:
-        """H times the next rows, not checked for finite numbers."""
+        """H times the next rows, without a check for finite numbers.  near_noise: see `expand`."""
         V = self.basis[self.size : self.size + self.width].T
         if near_noise and isnan(self.noise):
             V = torch.cat([V, SCALE * V[:, :1]], dim=1)

@@ -1,4 +1,4 @@
-"""The whole spectrum, by stochastic Lanczos quadrature (Golub and Meurant 1994; Ubaru, Chen and Saad 2017).
+"""The spectral density, by stochastic Lanczos quadrature (Golub and Meurant 1994; Ubaru, Chen and Saad 2017).
 
 For a start vector z of length 1 the Ritz values theta_j of m Lanczos steps and the squared first components w_j of T's
 eigenvectors are the Gauss rule of the measure mu_z(x) = sum_i (z . v_i)^2 delta(x - lambda_i):
@@ -7,25 +7,25 @@ eigenvectors are the Gauss rule of the measure mu_z(x) = sum_i (z . v_i)^2 delta
     tr f(H)    = n E z^T f(H) z           for independent entries of mean 0 and variance 1 / n
 
 Where a null space is known, with P the projector off it and r the rank of P, the start vectors are P z / |P z|.  The density is
-then that of the r other eigenvalues, and sums over them are r times its integrals.  |P z|^2 is r on average, so these are
-ratios: without bias for a Gaussian z, else with one that is sd(|P z|^2) / r times the spread it comes with.  Not to divide by
-|P z|^2 would add its own skewed spread to every sum.
+then that of the r other eigenvalues, and sums over them are r times its integrals.  |P z|^2 has the mean r, so these are ratio
+estimates: unbiased for a Gaussian z, else with a bias of sd(|P z|^2) / r standard deviations.  Without the division by |P z|^2
+its skewed spread would be added to every sum.
 
-**Uneven signs.**  Entries are random signs, which see a diagonal matrix without error, times magnitudes with squares uniform on
-[1 - UNEVEN, 1 + UNEVEN], which have a 600th of the variance of Gaussian entries there.  Signs alone coincide: of an eigenvalue
-that two rows share, all of k start vectors see the same direction with the probability 2^(1 - k), and it would pass for
-simple.  Uneven ones see directions about 0.03 apart, 30 times what SAME tells from none.
+**Start vectors.**  Entries are random signs, which are exact for a diagonal matrix, times magnitudes with squares uniform on
+[1 - UNEVEN, 1 + UNEVEN], which have a 600th of the variance of Gaussian entries there.  With signs alone, all k start vectors
+project onto the same line of the eigenspace of an eigenvalue that two rows share, with the probability 2^(1 - k): it would seem
+simple.  With uneven magnitudes the projections differ by an angle of about 0.03, 30 times what SAME resolves.
 
-**Eigenvalues that are known.**  A few eigenvalues that dominate are most of the variance over start vectors.  Eigenpairs that
-were found before are projected out as a null space is, and each is counted as the one eigenvalue that it is, instead of
-(z . v)^2 times.  The same is done with those that the first runs find.  A Ritz pair with a residual of at most SETTLED times
-its distance to the others is an eigenpair; its eigenvalue is simple where two start vectors come to the same eigenvector (of a
-multiple one each sees another).  Its node is taken out of the rules of the start vectors that found it; what remains of each is
-the Gauss rule of what remains of its measure.  The start vectors to come are projected off v.
+**Known eigenvalues.**  A few dominant eigenvalues are most of the variance over start vectors.  Eigenpairs found before are
+projected out like a null space, and each counts as one eigenvalue instead of (z . v)^2.  So do those that the first runs find:
+a Ritz pair with a residual of at most SETTLED times its distance to the others has converged, and its eigenvalue is simple
+where two start vectors have converged to the same eigenvector (of a multiple one, each converges to another).  Its node is
+removed from the rules of the start vectors that found it, which leaves the Gauss rule of the rest of their measure.  Later
+start vectors are projected off v.
 
-**Few long runs or many short ones.**  For a given number of products, longer runs make sum |lambda| better known where its
-bounds (`absolute_sum`) are wide or runs still find eigenvalues; more runs do where start vectors differ.  `Lengths` looks at
-both while the first runs are under way.
+**Few long runs or many short ones.**  For a given number of products, longer runs determine sum |lambda| better where its
+bounds (`absolute_sum`) are wide or more eigenvalues converge; more runs do where start vectors differ.  `Lengths` estimates
+both during the first runs.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,11 +48,12 @@ from landscape.spectrum.absolute_sum import absolute_integral
 from landscape.spectrum.rules import SpectralDensity
 
 UNEVEN = 0.1  # spread of the squares of a start vector's entries about 1
-SETTLED = 1e-4  # the error of an eigenvector that runs find
-FOUND, CLOSE = 1e-2, 0.1  # of one that was found before, and its residual, as a share of the eigenvalue
-SAME = 1e-6  # by which the squared cosine between two of them may miss 1
-# where their number is free: Student's interval of three is half as long again (`quantiles`), and kernels like blocks of four
-FEWEST_STARTS = 4
+SETTLED = 1e-4  # largest error of an eigenvector found by the runs
+FOUND, CLOSE = 1e-2, 0.1  # largest error of an eigenvector found before, and its residual over the eigenvalue
+SAME = 1e-6  # largest 1 - cos^2 between equal eigenvectors
+FEWEST_STARTS = (
+    4  # by default: Student's interval of three is half as long again (`quantiles`); kernels favour blocks of four
+)
 FIRST_LOOK, GROWTH = 12, 4 / 3  # steps
 CONFIDENCE = 0.95  # of the interval that is to be short
 
@@ -85,14 +86,13 @@ def spectral_density(
     """Gauss rules of random start vectors, one Lanczos run each.
 
     matvecs: products in all, at most.
-    starts: number of start vectors (2 or more), each with matvecs // starts steps; None: runs as long as pays (`Lengths`), and
-        as many of them as matvecs allow.  longest: the most steps of a run; None: no other limit than matvecs and the rank.
-    batch: runs at a time (memory: (batch + 1) vectors for each step of a run); eigenvalues are told apart as `known` only where
-        it is 2 or more.
-    active: leaves the eigenvalues of a known null space out; `dim` of the result is then the rank.
+    starts: number of start vectors (2 or more), each with matvecs // starts steps; None: length of the runs by `Lengths`, and
+        as many of them as matvecs allow.  longest: the most steps of a run; None: limited by matvecs and the rank alone.
+    batch: runs at a time (memory: (batch + 1) vectors for each step of a run); with 1, runs find no `known` eigenvalues.
+    active: excludes the eigenvalues of a known null space; `dim` of the result is then the rank.
     ends: eigenpairs found before by `extreme_eigenpairs`; those that are accurate enough are `known` from the beginning.
-    trace: of the operator, with its standard error, where it is known better than from so few start vectors.
-    watch: is given the first runs, H's own, before `ends` are taken out of them.
+    trace: of the operator, with its standard error, where known more accurately than from these start vectors.
+    watch: called with the first runs, which are of H itself, before `ends` are projected out of them.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([5.0, -1.0, *[2.0] * 98], dtype=torch.float64)))
@@ -121,10 +121,10 @@ def spectral_density(
 
 
 class Lengths:
-    """Stopping rule for the length of runs: it seeks the shortest interval of sum |lambda| for all products.
+    """Stopping rule for the length of runs, for the shortest interval of sum |lambda| with all products.
 
-    The interval is estimated as the first runs grow; they end with the first estimate that is wider.  best: steps.
-    traced: whether the trace is known.
+    The interval is estimated while the first runs grow; they stop at the first estimate that is wider than the last.
+    best: number of steps.  traced: whether the trace is known.
     """
 
     def __init__(self, matvecs: int, most: int, rest: int, traced: bool) -> None:
@@ -143,7 +143,7 @@ class Lengths:
         return False
 
     def half_width(self, runs: Sequence[tuple[Float64[Tensor, "m m"], float]], steps: int) -> float:
-        """Half width of the interval from runs of so many steps, with as many start vectors as products allow."""
+        """Half width of the interval from runs of this length, with as many start vectors as products allow."""
         nodes, weights, found = [], [], 0
         for T, length in runs:
             values, S = torch.linalg.eigh(T)
@@ -152,9 +152,9 @@ class Lengths:
             weights.append(S[0, ~known].square())
             found += int(known.sum())
         rest, starts = max(self.rest - found / len(runs), 0.0), self.matvecs / steps
-        low, _, high = absolute_integral(nodes[0], weights[0])  # of one run: they cost as much as a product
+        low, _, high = absolute_integral(nodes[0], weights[0])  # of one run alone, as it costs as much as a product
         x, w = torch.cat(nodes), torch.cat(weights) / len(runs)
-        unit = float(x.abs().max()) or 1.0 if len(x) else 1.0  # of squares that leave the range of floats
+        unit = float(x.abs().max()) or 1.0 if len(x) else 1.0  # so that squares stay in the range of floats
         x = x / unit
         squares = float((w * x.square()).sum())
         if self.traced and squares:
@@ -165,7 +165,11 @@ class Lengths:
 
 
 class _Runs:
-    """The rules of the runs so far, and the eigenvalues that are known, with their vectors."""
+    """The rules of the runs so far, and the known eigenvalues with their vectors V.
+
+    values: eigenvalues of the pairs found before, which `deflated`, the operator projected off their vectors, lacks; error: the
+    largest of their vectors' errors.  rules: nodes, weights, and whether they are the start vector's measure itself.
+    """
 
     def __init__(
         self,
@@ -176,19 +180,19 @@ class _Runs:
         progress: Callable[[int, str], object],
         watch: Callable[[Sequence[LanczosFactorization]], object] | None,
     ) -> None:
-        self.watch, self.whole = watch, operator
+        self.watch, self.operator = watch, operator
         self.generator, self.active, self.progress = generator, active, progress
         self.rank = operator.dim if active is None else active.rank
         self.known, self.residuals, V, self.error = found_before(ends, operator, generator.device)
-        self.values = self.known  # of V's columns
-        self.operator = ProjectedOperator(operator, lambda X: X - V @ (V.T @ X)) if V.shape[1] else operator
+        self.values = self.known
+        self.deflated = ProjectedOperator(operator, lambda X: X - V @ (V.T @ X)) if V.shape[1] else operator
         self.V, self.matvecs = V, 0
         self.noise = 0.0 if ends is None or isnan(ends.noise) else ends.noise  # of a product
-        self.rules: list[tuple[Float64[Tensor, " m"], Float64[Tensor, " m"], bool]] = []  # nodes, weights, all of it
+        self.rules: list[tuple[Float64[Tensor, " m"], Float64[Tensor, " m"], bool]] = []
 
     def add(self, count: int, steps: int, enough: Lengths | None = None) -> None:
-        """So many runs, side by side."""
-        if len(self.known) == self.rank:  # nothing is left to be seen
+        """Add `count` runs in one batch.  enough: stopping rule of their length."""
+        if len(self.known) == self.rank:  # no unknown eigenvalue is left
             self.rules += [(self.known[:0], self.known[:0], True)] * count
             return
         Z = draw_starts(self.operator.dim, count, self.generator, self.operator.dtype)
@@ -202,7 +206,7 @@ class _Runs:
         def report(done: int, _: int, state: str) -> None:
             self.progress(before + done, f"density: {state}")
 
-        runs = lanczos(self.operator if watch is None else self.whole, Z, steps, report, size, enough)
+        runs = lanczos(self.deflated if watch is None else self.operator, Z, steps, report, size, enough)
         self.matvecs += sum(len(run.T) for run in runs)
         if watch is not None:
             watch(runs)
@@ -220,7 +224,8 @@ class _Runs:
             self.rules.append((values[left], mass / mass.sum(), norm(run.r) == 0))
 
     def density(self, trace: tuple[float, float] | None) -> SpectralDensity:
-        """All of them, with nodes of weight 0 after those of shorter ones: after m that are all of it, m + 1 (`quantiles`)."""
+        """The density of all rules, in one table: shorter ones are filled up with nodes of weight 0, by which `quantiles` needs
+        at least m + 1 after m nodes that are the measure itself."""
         longest = max((1 + whole) * len(nodes) + whole for nodes, _, whole in self.rules)
         nodes = torch.zeros(len(self.rules), longest, dtype=torch.float64)
         weights = torch.zeros_like(nodes)
@@ -234,7 +239,7 @@ class _Runs:
 
 
 def draw_starts(n: int, count: int, generator: torch.Generator, dtype: torch.dtype) -> Float[Tensor, "n count"]:
-    """Random signs of uneven magnitudes: of mean 0 and variance 1."""
+    """Random signs times uneven magnitudes; entries of mean 0 and variance 1."""
     rows = torch.empty(count, n, dtype=dtype, device=generator.device)
     for row in rows:
         row.uniform_(-1, 1, generator=generator)
@@ -244,7 +249,7 @@ def draw_starts(n: int, count: int, generator: torch.Generator, dtype: torch.dty
 def found_before(
     ends: EigenEnds | None, operator: SymmetricOperator, device: torch.device
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Float[Tensor, "n k"], float]:
-    """Eigenvalues, residuals, orthonormal vectors and the largest vector error of the pairs that are good."""
+    """Eigenvalues, residuals, orthonormal vectors and the largest vector error, of the pairs that are accurate enough."""
     if ends is None:
         none = torch.zeros(0, dtype=torch.float64)
         return none, none, torch.zeros(operator.dim, 0, dtype=operator.dtype, device=device), 0.0
@@ -260,10 +265,10 @@ def found_before(
 def without(
     run: LanczosFactorization, V: Float[Tensor, "n k"], values: Float64[Tensor, " k"], error: float
 ) -> LanczosFactorization:
-    """The run that P H P, P = 1 - V V^T, would have made from P z, for eigenvectors V of H, off by `error`: P and H commute.
+    """The Lanczos run of P H P, P = 1 - V V^T, from P z, without further products, for eigenvectors V of H: P and H commute.
 
-    Its space is that of P Q, where P H P is T - C diag(values) C^T and the Gram matrix 1 - C C^T, C = Q^T V.  Directions of Q
-    that lie in V, as far as round-off and the error tell, are left out.
+    P Q spans its Krylov space, with the matrix T - C diag(values) C^T of P H P and the Gram matrix 1 - C C^T, C = Q^T V.
+    Directions of Q within V, up to round-off and the `error` of V, are left out.
     """
     if not len(values):
         return run
@@ -282,7 +287,7 @@ def without(
 
 
 def missed(values: Float64[Tensor, " k"], residuals: Float64[Tensor, " k"]) -> Float64[Tensor, " k"]:
-    """See `SpectralDensity.of_known` and `residuals`; an eigenvalue of 0 adds nothing."""
+    """`SpectralDensity.missed` of known eigenvalues with these residuals; 0 for an eigenvalue of 0."""
     share = torch.where(values == 0, 0.0, residuals / values.abs())
     return 4 * share * share.clamp_max(1.0)
 
@@ -290,16 +295,16 @@ def missed(values: Float64[Tensor, " k"], residuals: Float64[Tensor, " k"]) -> F
 def pushed(
     values: Float64[Tensor, " k"], known: Float64[Tensor, " l"], residuals: Float64[Tensor, " l"]
 ) -> Float64[Tensor, " k"]:
-    """Bound of the distance of eigenvalues on the complement of known pairs from eigenvalues of H; they couple by residuals.
+    """Bound of the distance from eigenvalues of the deflated operator to eigenvalues of H.
 
-    (hypot(g, 2 r) - g) / 2 for each pair at the distance g (Li and Li 2005).
+    The known pairs couple to them by their residuals r: (hypot(g, 2 r) - g) / 2 for each at the distance g (Li and Li 2005).
     """
     gaps, reach = (values[:, None] - known).abs(), 2 * residuals.expand(len(values), -1)
     return (torch.hypot(gaps, reach) - gaps).sum(dim=1) / 2
 
 
 def settled(values: Float64[Tensor, " m"], S: Float64[Tensor, "m m"], length: float) -> Bool[Tensor, " m"]:
-    """Mask of the Ritz pairs that are eigenpairs.  values, S: of T; length: of r."""
+    """Mask of the Ritz pairs that have converged.  values, S: eigenpairs of T; length: |r|."""
     far = torch.tensor([inf], dtype=torch.float64)
     gaps = torch.diff(values, prepend=-far, append=far)
     return length * S[-1].abs() <= SETTLED * torch.minimum(gaps[:-1], gaps[1:])
@@ -308,7 +313,7 @@ def settled(values: Float64[Tensor, " m"], S: Float64[Tensor, "m m"], length: fl
 def found_by_all(
     runs: Sequence[LanczosFactorization], spectra: Sequence[tuple[Tensor, Tensor]]
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Float[Tensor, "n k"], list[Bool[Tensor, " m"]]]:
-    """The simple eigenvalues that all runs have found, with residuals and vectors, and which nodes of each run are others."""
+    """The simple eigenvalues that all runs have found, with residuals and vectors, and a mask of each run's other nodes."""
     masks = [settled(values, S, norm(run.r)) for run, (values, S) in zip(runs, spectra, strict=True)]
     vectors = [run.Q @ S[:, mask].to(run.Q) for run, (_, S), mask in zip(runs, spectra, masks, strict=True)]
     same = [gram(vectors[0], other).cpu().square() > 1 - SAME for other in vectors]

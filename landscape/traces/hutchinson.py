@@ -1,8 +1,8 @@
-"""Hutchinson's estimator, E z^T H z = tr H for E z z^T = I (Girard 1989, Hutchinson 1990), until the error is small enough.
+"""Hutchinson's estimator, E z^T H z = tr H for E z z^T = I (Girard 1989, Hutchinson 1990), with a sequential stopping rule.
 
-An adaptive run stops when half the width of the interval is below max(rtol |trace|, atol).  Each look at the error is a chance
-to stop on a spread that is too small by luck.  So a run looks only when the number of probes has grown by half since the last
-look, stops only if the tolerance still holds four probes later (Simons 1968), and widens its interval by 5%.
+An adaptive run stops when half the width of its interval is at most max(rtol |trace|, atol).  Every look at the interval may
+find it too short by chance.  So a run looks only when the number of probes has grown by the factor GROWTH since the last look,
+stops only if the tolerance still holds CONFIRMATION probes later (Simons 1968), and widens its interval by WIDENING.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ from landscape.traces.quadratic import FEWEST, PowerSums, mean_interval, power_s
 
 Reading = Literal["block", "full"]
 Method = Literal["auto", "hutchinson", "hutch++", "xtrace"]
-LEAST = 8  # probes that an interval needs: see the degrees of freedom in `quadratic`
+LEAST = 8  # probes, for an interval: see the degrees of freedom in `quadratic`
 GROWTH = 1.5  # ratio of the numbers of probes at two looks
 CONFIRMATION = 4  # probes between reaching the tolerance and stopping
 WIDENING = 1.05  # factor of the interval of an adaptive run
@@ -86,7 +86,7 @@ class TraceSettings:
         reading: Reading = "block",
         method: Method = "hutchinson",
     ) -> "TraceSettings":
-        """Exactly this many probes, whatever the error.  For methods other than "hutchinson": matvecs."""
+        """Settings for exactly this many probes; for methods other than "hutchinson", matvecs."""
         return cls(distribution, reading, rtol=0.0, min_probes=probes, max_probes=probes, method=method)
 
     @property
@@ -105,7 +105,7 @@ class TraceSettings:
 
 
 class StoppingRule:
-    """The looks of an adaptive run at its error.  next: the number of probes at the next look."""
+    """When an adaptive run looks at its interval, and when it ends.  next: number of probes at the next look."""
 
     def __init__(self, first: int, most: int, confirmation: int = CONFIRMATION) -> None:
         self.next, self._most, self._confirmation, self._confirming = first, most, confirmation, False
@@ -120,10 +120,10 @@ class StoppingRule:
 
 
 class Hutchinson:
-    """Hutchinson's estimator on one operator, for every one of its groups of rows at once.
+    """Hutchinson's estimator on one operator, for several groups of rows at once.
 
-    rows: named groups of rows.  samples: z^T H z, a line for each group.  known: a part of the trace that is not in the
-    operator.  spent: matvecs that this part took.  keep: up to this number, probes and their products stay in `kept`.
+    rows: the groups, by name.  samples: z^T H z, a row for each group.  known: part of the trace that the operator lacks;
+    spent: matvecs of this part.  keep: number of probes up to which they and their products stay in `kept`.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class Hutchinson:
         return {name: power_sums(Z[rows], Y[rows], kind) for name, rows in self.rows.items()}
 
     def _estimates(self, reason: StopReason) -> dict[str, TraceEstimate]:
-        """The estimates so far, with the reason "tolerance" where it is reached and the given one elsewhere."""
+        """The estimates so far.  reason: of those that have not reached the tolerance."""
         settings, results, opened = self.settings, {}, self._open_groups()
         probes = self.samples.shape[1]
         widening = WIDENING if settings.adaptive else 1.0

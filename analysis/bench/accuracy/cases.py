@@ -1,13 +1,13 @@
 """Cases of the accuracy study: operators with known traces, spectrum and diagonal, and the cost of their products.
 
-    splats      the Hessian of a small synthetic scene, made dense in float64: the truth is its eigendecomposition.  Methods are
-                given the same matrix in float32, and charged for a product what the scene's kernels take for it.  Only
+    splats      the Hessian of a small synthetic scene as a dense matrix in float64, whose eigendecomposition is the truth.
+                Methods get the same matrix in float32; a product costs what the scene's kernels take for it.  Only
                 `exact_traces`, which needs more than products, and the comparison of precisions run on the scene itself.
     matrices    random eigenvectors, prescribed eigenvalues
-    checkpoint  a trained scene, with a converged long run as truth (`accuracy_checkpoint`)
+    checkpoint  a trained scene, with a converged long run as truth (`analysis.bench.accuracy.checkpoint`)
 
-The scale of a block's trace is sum |H_ii| over the block (over all rows where the block is zero); that of an end of the
-spectrum is its magnitude, as for the stopping rules of all methods (the larger end's, where it is zero to round-off).
+The scale of a block's trace is sum |H_ii| over the block (over all rows where the block is zero).  That of an end of the
+spectrum is its magnitude, as in the stopping rules of all methods (the larger end's, where it is zero to round-off).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -36,7 +36,7 @@ SETTINGS = SyntheticSettings(60, 2, 24, 18, sh_degree=0)
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """True values that estimates are compared with.  diagonal: None where it is not known."""
+    """True values that estimates are compared with.  diagonal: None where not known."""
 
     traces: Mapping[str, float]
     scales: Mapping[str, float]
@@ -49,7 +49,7 @@ class Truth:
 
     @classmethod
     def of(cls, matrix: Float64[Tensor, "n n"], blocks: Mapping[str, slice]) -> "Truth":
-        """All of it, from a dense matrix."""
+        """The truth of a dense matrix."""
         values, diagonal = torch.linalg.eigvalsh(matrix), matrix.diagonal()
         total = float(values.abs().sum())
         return cls(
@@ -65,7 +65,7 @@ class Truth:
 
 
 def weighted_quantile(magnitudes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"], share: float = SHARE) -> float:
-    """The magnitude that this share of all weight lies at or below.
+    """Weighted quantile: the magnitude at or below which this share of the weight lies.
 
     >>> weighted_quantile(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([3.0, 1.0, 2.0]), share=0.4)
     2.0
@@ -77,10 +77,10 @@ def weighted_quantile(magnitudes: Float64[Tensor, " m"], weights: Float64[Tensor
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """An operator with what is true of it.
+    """An operator with its true values.
 
-    price: seconds of a product with k vectors; None where the operator's own time counts.  objective: the scene, if it is one.
-    products: its kernels' products by precision, for matrices those of the dense one.
+    price: seconds of a product with k vectors; None: those measured.  objective: the scene, None of a matrix.  products: the
+    scene's kernels by precision, None of a matrix.
     """
 
     name: str
@@ -94,7 +94,7 @@ class Case:
 
     @property
     def round_off(self) -> float:
-        """Bound of the products' rounding in an estimate, as a share of its scale: independent roundings of every row."""
+        """Round-off of an estimate, relative to its scale: sqrt(rows) eps, of independent roundings in every row."""
         return self.operator.dim**0.5 * torch.finfo(self.operator.dtype).eps
 
     @property
@@ -105,15 +105,15 @@ class Case:
 
     @cached_property
     def ends(self) -> EigenEnds:
-        """Both ends, by the library's defaults."""
+        """Both ends, by `extreme_eigenpairs` with its defaults."""
         return extreme_eigenpairs(self.operator, torch.Generator().manual_seed(0))
 
 
 class MeteredOperator:
-    """The operator of a case, with counts of its use.
+    """The operator of a case, which counts its products.
 
-    matvecs: vectors applied, and whatever was charged.  seconds: that the products cost, at the case's price where it has one;
-    spent: that they took here, by the clock.
+    matvecs: vectors applied, and other work charged.  seconds: of the products, at the case's price where it has one; spent:
+    of the products as measured.
     """
 
     def __init__(self, case: Case) -> None:
@@ -132,16 +132,16 @@ class MeteredOperator:
         return result
 
     def charge(self, matvecs: float) -> None:
-        """Count work that is not done in products, but worth so many of them."""
+        """Count other work, in units of a product with one vector."""
         self.matvecs += matvecs
 
 
 def _product(operator: SymmetricOperator, V: Tensor) -> Tensor:
-    """H V; of a matrix only the columns that meet anything, so that a block's products are as quick as they are small."""
+    """H V.  Of a matrix, only the columns from the first to the last row of V that is not 0: quick products of blocks."""
     if not isinstance(operator, DenseOperator):
         return operator.apply(V)
-    met = V.any(dim=1).nonzero()
-    rows = slice(int(met[0]), int(met[-1]) + 1) if len(met) else slice(0, 0)
+    used = V.any(dim=1).nonzero()
+    rows = slice(int(used[0]), int(used[-1]) + 1) if len(used) else slice(0, 0)
     return operator.matrix[:, rows] @ V[rows]
 
 
@@ -149,7 +149,7 @@ def _product(operator: SymmetricOperator, V: Tensor) -> Tensor:
 
 
 def spectra(n: int = ROWS) -> dict[str, Float64[Tensor, " n"]]:
-    """Eigenvalues as curvature has them: a power law, clusters at the ends, both signs, few that are not zero, none large."""
+    """Spectra like those of curvature: a power law, clusters at the ends, both signs, few nonzero ones, none dominant."""
     i = torch.arange(n, dtype=torch.float64)
     ends = torch.where(i < 5, 1 - 1e-3 * i, torch.where(i >= n - 4, -0.3, 0.3 * i / n))
     return {
@@ -176,8 +176,8 @@ def matrix_cases(seed: int) -> Iterator[Case]:
 
 
 def splat_cases(seed: int, scenes: int = 1) -> dict[str, Callable[[], Case]]:
-    """Makers of the scenes, by name: one far from its fit and one near it, with SSIM; and one with the pixel loss alone, whose
-    traces are exact.  Of more scenes the k-th of a kind is another world from another seed, NAME #k."""
+    """Constructors of the scenes, by name: two with SSIM, far from a fit and near it; one with the pixel loss alone, whose
+    traces are exact.  scenes: of each kind, from different seeds; the k-th is called NAME #k."""
     kinds = {
         "far from a fit": (0.2, LossSettings()),
         "near a fit": (0.02, LossSettings()),
@@ -212,7 +212,7 @@ def splat_case(name: str, noise: float, loss: LossSettings, seed: int, settings:
 
 
 def price_of(operator: SymmetricOperator) -> Callable[[int], float]:
-    """Seconds of a product with k vectors, in the widest blocks that fit; a block's is the shortest of three times."""
+    """Seconds of a product with k vectors, split into the widest blocks of WIDTHS; a block's is the shortest of three."""
     seconds = {}
     for width in WIDTHS:
         V = torch.ones(operator.dim, width, dtype=operator.dtype)

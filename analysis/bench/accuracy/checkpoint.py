@@ -1,11 +1,11 @@
-"""A trained scene as a case of the accuracy study: its truth is a long run, kept beside the results.
+"""A trained scene as a case of the accuracy study.  Its truth is a long run, kept in OUT/truth.json:
 
     traces    `exact_traces` of SAMPLES samples
     ends      Lanczos to a residual of FINE
     sums      quadrature with STARTS x STEPS products
 
-OUT/truth.json belongs to one checkpoint at one size of its pictures; for another it is computed anew.  The truth of the sums is
-known to half its brackets, a few percent; estimates that are better than that cannot be told apart.  There is no truth of the
+The file belongs to one checkpoint at one size of its pictures; for another it is computed again.  The truth of the sums is
+known to half its brackets, a few percent; estimates that are more accurate cannot be compared.  There is no truth of the
 diagonal, which would take a product for every row.
 """
 
@@ -56,7 +56,7 @@ def checkpoint_case(path: Path, out: Path, downscale: float = 1.0) -> Case:
 
 def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:
     def generator(stream: int) -> torch.Generator:
-        return torch.Generator().manual_seed(1_000_000 + stream)  # far from the seeds of what is compared
+        return torch.Generator().manual_seed(1_000_000 + stream)  # far from the seeds of the methods' runs
 
     traces = exact_traces(objective, generator(0), TraceSettings.fixed(SAMPLES))
     scales = {

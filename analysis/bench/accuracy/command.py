@@ -1,27 +1,27 @@
-"""The accuracy study: products H v and seconds against true error, every estimator and setting, beside what people use.
+"""The accuracy study: products H v and seconds against true error, of every estimator and setting and of other packages.
 
-OUT/accuracy.csv          a line a case, quantity, part, method, settings and seed: matvecs, seconds, true and reported error,
-                          whether the truth was where the method said (of a diagonal: in which share of the rows)
-OUT/accuracy_points.csv   the same, a line a case, quantity, method and settings: means; of errors root mean squares over
-                          parts and seeds
-OUT/accuracy_ratios.csv   what the defaults need over what the best peer, and our own best other setting, need
-OUT/accuracy_QUANTITY.png drawn by `figures.accuracy` from accuracy_points.csv
+    OUT/accuracy.csv          a line for each case, quantity, part, method, settings and seed: matvecs, seconds, true and
+                              reported error, whether the interval contains the truth (of a diagonal: the share of rows)
+    OUT/accuracy_points.csv   a line for each case, quantity, method and settings: means over parts and seeds, of errors root
+                              mean squares
+    OUT/accuracy_ratios.csv   work of the default over that of the best peer ("peer") and of our best other setting ("own")
+    OUT/accuracy_QUANTITY.png drawn by `figures.accuracy` from accuracy_points.csv
 
-Errors are shares of a scale: of the sum of |H_ii| over the block (traces), of |diag H|, and of the value itself (ends, sums
-over the spectrum; of the larger end where an end is zero).  Errors below the round-off of the products count as that.
-Matvecs and seconds are those of all parts of a quantity together.
+Errors are relative to a scale: the sum of |H_ii| over the block (traces), |diag H|, and the value itself (ends, sums over the
+spectrum; the larger end where an end is zero).  Errors below the round-off of the products count as that.  Matvecs and seconds
+are those of all parts of a quantity together.
 
-**At equal true error.**  A ratio is the default's mean matvecs over those that a rival needs for the same error e, that of the
-default over all seeds.
+**At equal true error.**  A ratio is the default's mean matvecs over those that a rival needs for the default's error e, the
+root mean square over all seeds.
 
-- A rival's settings make a polygon of error over matvecs, on logarithmic axes, in which its matvecs at e are read.  A setting
-  counts with the largest error of its own and of the costlier ones: where it is better than one of more work, it is so by
-  chance, and nobody who does not know the truth would have stopped there.
-- Beyond either end of the polygon the ratio is a bound, "≤" or "≥".
-- An estimator that several packages have alike is one rival: the luckiest of equals would seem better than any is.
-- Peers without a stopping rule are given the budget that suits e, which their users cannot know.
-- The interval of the ratio is a bootstrap over seeds.  What is asked holds ("yes") where the whole interval is below it, does
-  not ("no") where all of it is above, and is "open" otherwise.
+- A rival's matvecs at e are interpolated between its settings, in log error against log matvecs.  A setting's error is the
+  largest of its error and those of the costlier settings: being better than one with more work is chance, and a user who does
+  not know the truth would not have stopped there.
+- Beyond the cheapest and the costliest setting the ratio is a bound, "≥" or "≤".
+- The same estimator in several packages is one rival: the best of several equal ones would look better than each.
+- Peers without a stopping rule get the budget that reaches e, which their users cannot know.
+- The ratio's interval is a bootstrap over seeds.  The ratio asked for holds ("yes") where the whole interval is at most that,
+  does not ("no") where the whole interval is above, and is "open" otherwise.
 """
 
 from collections.abc import Iterator, Sequence
@@ -51,13 +51,13 @@ from landscape.probes import draw_probes
 
 SEED = 0
 TITLES = {"peer": "the defaults at equal true error: over the best peer", "own": "over our own best other setting"}
-# of the repetitions: a scene has five blocks' traces to each seed; other quantities vary less, or take longer
+# seeds over --repetitions: a scene gives five blocks' traces for each seed; other quantities vary less or take longer
 SEEDS_OF_FAMILY = {"matrices": 1.0, "splats": 0.2, "checkpoint": 0.14}
 SEEDS_OF_QUANTITY = {"traces": 3.0, "ends": 0.5, "sums": 0.5, "diagonal": 1.0}
-# a rival's 20 steps miss an end once in 20 runs: that is not for 4 seeds to decide
+# in place of the product of both: a rival that misses an end in one run of 20 needs more than 4 seeds
 SEEDS_OF_BOTH = {("splats", "ends"): 1.0}
-OTHERS = 0.25  # of the seeds, for settings of ours that are not the default: nothing is asked of them
-FEWEST_SEEDS = 2  # a bootstrap needs two at least
+OTHERS = 0.25  # factor of the seeds of our settings other than the default, of which no ratio is asked
+FEWEST_SEEDS = 2  # for a bootstrap
 PROBES = 8  # quadratic forms of the comparison of precisions
 PRECISION_SEEDS = 5
 PRECISIONS = {  # of the products, and of the sums over rows
@@ -104,7 +104,7 @@ def measure(case: Case, method: Method, seed: int) -> list[Run]:
 
 
 def scored(case: Case, quantity: str, answer: Answer) -> tuple[float, float, float]:
-    """True error, reported error, and whether the truth is in the interval (with room for round-off); nan: none reported."""
+    """True error, reported error, and whether the interval, widened by round-off, contains the truth; nan: none reported."""
     truth, scale = truth_of(case, quantity, answer.part)
     as_vector = torch.as_tensor(answer.value, dtype=torch.float64)
     low, high, error = (torch.as_tensor(x, dtype=torch.float64) for x in (answer.low, answer.high, answer.error))
@@ -128,8 +128,8 @@ def truth_of(case: Case, quantity: str, part: str) -> tuple[Tensor, float]:
             assert truth.diagonal is not None
             return truth.diagonal, float(truth.diagonal.norm())
         case _:
-            names = {"sum of |lambda|": "absolute_sum"}
-            value = getattr(truth, names.get(quantity, quantity.replace(" ", "_")))
+            name = "absolute_sum" if quantity == "sum of |lambda|" else quantity.replace(" ", "_")
+            value = getattr(truth, name)
             scale = abs(value)
     return torch.tensor(value, dtype=torch.float64), scale
 
@@ -138,9 +138,9 @@ def truth_of(case: Case, quantity: str, part: str) -> tuple[Tensor, float]:
 
 
 def precision_runs(case: Case, seed: int) -> Iterator[Run]:
-    """z . H z with the products and the sums in either precision, against both in float64 with the same z.
+    """The error of z . H z due to rounding: products and sums in either precision, against both in float64 with the same z.
 
-    The error is of the mean of a few forms, over the mean of |z| |H z|: what rounding alone adds to an estimate.
+    The error is that of the mean over PROBES vectors z, over the mean of |z| |H z|.
     """
     products = case.products
     if products is None:
@@ -159,7 +159,7 @@ def precision_runs(case: Case, seed: int) -> Iterator[Run]:
 
 
 def quadratic_forms(operator: SymmetricOperator, Z: Tensor, sums: torch.dtype) -> Tensor:
-    """z . H z, H z in the operator's precision, the sum over rows in another."""
+    """z . H z, with H z in the operator's precision and the sum over rows in that of `sums`."""
     Z = Z.to(operator.dtype)
     return (Z.to(sums) * operator.apply(Z).to(sums)).sum(dim=0)
 
@@ -168,7 +168,7 @@ def quadratic_forms(operator: SymmetricOperator, Z: Tensor, sums: torch.dtype) -
 
 
 def run_accuracy(options: BenchOptions) -> int:
-    """Run every method on every case; print, write and draw what came of it; returns the exit code 0."""
+    """Run every method on every case; print, write and draw the results; returns the exit code 0."""
     console, errors = Console(), Console(stderr=True)
     options.out.mkdir(parents=True, exist_ok=True)
     runs: list[Run] = []

@@ -7,8 +7,8 @@ A method is run on an operator that counts, with a seed, and returns an `Answer`
     sum of |lambda|, effective rank, mass quantile     one part, from one spectral density ("sums")
     diagonal          one part, a vector
 
-Work that is not products H v is charged in products: PASS for a pass over the pixels for every Gaussian's block, with the
-ends of the blocks; JACOBIAN for a product with the images' Jacobian.
+Work other than products H v is counted in products: PASS for a pass over the pixels that computes the diagonal block of every
+Gaussian and the ends of their spectra; JACOBIAN for a product with the images' Jacobian.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -40,14 +40,12 @@ from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.traces import ONE_PERCENT, exact_traces
 
 Origin = Literal["default", "own", "peer"]
-PASS = 1.35  # the most that fern after 2,000 steps took, of vectors of 256 and 512 bits: 1.2 for the pass, 0.15 for the ends
-# its share of a product's arithmetic: there is no backward pass
+PASS = 1.35  # 1.2 for the pass, 0.15 for the ends
+# a product's operations without those of its backward pass
 JACOBIAN = OPERATIONS["J u 1"] / (OPERATIONS["J u 1"] + OPERATIONS["tangent of backward 1"])
 BUDGETS = (12, 24, 48, 96)  # matvecs a block
-# on a trained scene, whose products cost too much for more, and for what matrices have shown to be as good as another
-# method, or no rival
-FEW_BUDGETS = (12, 36)
-LEFT_OUT = (
+FEW_BUDGETS = (12, 36)  # on a checkpoint, whose products are expensive
+LEFT_OUT = (  # on a checkpoint: on matrices these are no better than another method
     "Hutchinson, Gaussian",
     "Hutchinson, adaptive",
     "chosen by",
@@ -57,7 +55,7 @@ LEFT_OUT = (
     "in blocks",
 )
 TOLERANCES = (1e-1, 1e-2)  # of residuals; 1e-3 is the default
-DENSITIES = ((2, 12), (4, 24), (8, 48))  # start vectors and steps; by default 192 products are divided as they go
+DENSITIES = ((2, 12), (4, 24), (8, 48))  # start vectors and steps; by default 192 products, divided adaptively
 PROBES = (8, 16, 64)  # of a diagonal; 32 is the default
 CONFIDENCE = 0.95
 SKETCHES: dict[TraceMethod, str] = {"hutch++": "Hutch++", "xtrace": "XTrace"}
@@ -65,10 +63,7 @@ SKETCHES: dict[TraceMethod, str] = {"hutch++": "Hutch++", "xtrace": "XTrace"}
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """An estimate.  error: as the method reports it (nan: it does not); low, high: where it says that the truth is.
-
-    error, low and high of a diagonal are vectors, too.
-    """
+    """An estimate.  error: as the method reports it, nan without; low, high: its interval.  All are vectors for a diagonal."""
 
     part: str
     value: float | Float64[Tensor, " n"]
@@ -78,7 +73,7 @@ class Answer:
 
 
 Run = Callable[[Case, MeteredOperator, int], list[Answer]]
-"""A method's run on a case, by an operator that counts, with a seed: the answers, one a part."""
+"""A method's run on a case, with its operator and a seed: an answer for each part."""
 Applies = Callable[[Case], bool]
 
 
@@ -98,7 +93,7 @@ def is_matrix(case: Case) -> bool:
 class Method:
     """One estimator at one setting.
 
-    estimator: the name of what several packages have alike, "" where this method stands alone.
+    estimator: a common name of the same estimator in several packages, "" of one package alone.
     """
 
     quantity: str
@@ -115,12 +110,12 @@ def generator(seed: int) -> torch.Generator:
 
 
 def affordable(method: Method) -> bool:
-    """Whether a method is run on a checkpoint, whose diagonal nothing but a product for every row gives."""
+    """Whether a method is run on a checkpoint, where the true diagonal is not known."""
     return method.quantity != "diagonal" and not any(name in method.name for name in LEFT_OUT)
 
 
 def own_methods(budgets: tuple[int, ...] = BUDGETS) -> Iterator[Method]:
-    """All of them; the library's defaults are marked."""
+    """The methods of this library; the origin of its defaults is "default"."""
     yield from trace_methods(budgets)
     yield from end_methods()
     yield from density_methods()
@@ -195,7 +190,7 @@ def _lanczos(text: str, settings: EigenSettings, origin: Origin = "own", applies
 
 
 def _from_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
-    """Ends from the start vectors of `landscape probe`, but without the pixelwise part, which that has from the traces."""
+    """Ends from the start vectors of `landscape probe`, but without the pixelwise blocks, which that has from the traces."""
     start = BlockEigenvectors(case.scene, case.scene.block_diagonal(approximate=True)).warm_start()
     operator.charge(PASS)
     return _end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
@@ -217,7 +212,7 @@ def _end_answers(ends: EigenEnds) -> list[Answer]:
 
 
 def density_methods() -> Iterator[Method]:
-    """The quantile's lambda_1 is that of Lanczos as it is by default, which a probe has anyway: its products do not count."""
+    """Sums from one density.  Products for the quantile's lambda_1 (`Case.ends`) do not count, as a probe has both ends."""
     yield _density("as it goes", "default")
     for starts, steps in DENSITIES:
         yield _density(f"{starts} x {steps}", "own", matvecs=starts * steps, starts=starts)
@@ -225,7 +220,7 @@ def density_methods() -> Iterator[Method]:
 
 
 def _density(text: str, origin: Origin, known: bool = False, **division: int) -> Method:
-    """known: as a probe has it, which needs traces and ends for themselves: their products do not count."""
+    """known: with the true trace and the ends given, as in a probe; their products do not count."""
 
     def run(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         before = {"ends": case.ends, "trace": (sum(case.truth.traces.values()), 0.0)} if known else {}
@@ -262,7 +257,7 @@ def _diagonal(_: Case, operator: MeteredOperator, seed: int, probes: int, method
 
 
 def _diagonal_of_blocks(case: Case, operator: MeteredOperator, _: int) -> list[Answer]:
-    """The diagonal of every Gaussian's approximate block, less the radial directions of the quaternions; exact without SSIM."""
+    """The diagonal of the Gaussians' approximate blocks, without radial directions of quaternions; exact without SSIM."""
     parts = case.scene.block_diagonal(approximate=True).diagonals_across(case.scene.active.quats)
     values = torch.empty(case.operator.dim, dtype=torch.float64)
     for name, rows in case.operator.blocks.items():

@@ -1,9 +1,8 @@
 """Other packages' estimators on the same operators: SciPy, curvlinops, PyHessian and hessian-eigenthings, as published.
 
-SciPy always runs.  The others run where they are installed (`pip install -e '.[peers]'`); `peer_methods` says which
-are not.  Each is given an operator of its own kind around ours, so that its products are counted like ours; nothing of
-its algorithm is changed.  Where a peer finds one end of the spectrum or the eigenvalue of largest magnitude, it is run as its
-users would for both: a run an end, or a second run on H less the eigenvalue found.  Blocks' traces are a run a block.
+SciPy always runs; the others where they are installed (`pip install -e '.[peers]'`).  Each gets an operator of its type that
+wraps ours, so that products are counted alike; its algorithm is unchanged.  A peer that finds one end of the spectrum runs once
+for each end; one that finds the eigenvalue of largest magnitude runs again on H shifted by it.  Traces are one run a block.
 """
 
 import importlib
@@ -28,9 +27,12 @@ PACKAGES = {
     "pyhessian": "pyhessian",
     "hessian_eigenthings": "hessian-eigenthings",
 }
-ALIKE = {"Hutchinson": "the packages' Hutchinson", "Hutch++": "the packages' Hutch++"}  # random signs, the same sums
+ALIKE = {
+    "Hutchinson": "the packages' Hutchinson",
+    "Hutch++": "the packages' Hutch++",
+}  # the same estimator in all packages
 ENDS = {"largest": "LA", "smallest": "SA"}
-# of a Lanczos run, a seventh apart: its error falls to round-off within a few steps, between which nothing can be read
+# of a Lanczos run, close together, as its error falls to round-off within a few steps
 STEPS = (10, 12, 14, 16, 18, 20, 23, 26, 30, 35, 40, 46, 53, 61, 70, 80)
 POWER_STEPS = (50, 150)
 DIAGONALS = (8, 12, 16, 24, 32, 48, 64)  # matvecs; exact from twice the rank on
@@ -51,7 +53,7 @@ def peer_methods(budgets: tuple[int, ...] = BUDGETS) -> tuple[list[Method], list
 
 
 def _method(quantity: str, name: str, settings: str, run: Run, estimator: str = "") -> Method:
-    """A peer that draws from torch's global generator draws what the seed says; the generator's state is put back."""
+    """A peer's method, which runs with torch's global generator seeded; the generator's state is restored."""
 
     def seeded(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         with torch.random.fork_rng(devices=[]):
@@ -62,12 +64,12 @@ def _method(quantity: str, name: str, settings: str, run: Run, estimator: str = 
 
 
 def _by_block(trace: Callable[[SymmetricOperator], Any]) -> Run:
-    """A run a block."""
+    """A run on each block; nan where a sketch is singular."""
 
     def of(operator: SymmetricOperator) -> float:
         try:
             return float(trace(operator))
-        except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]; where a sketch is singular
+        except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
             return nan
 
     return lambda _, operator, __: [Answer(name, of(RestrictedOperator(operator, name))) for name in operator.blocks]
@@ -81,7 +83,7 @@ def _ordered(first: float, other: float) -> list[Answer]:
 
 
 def scipy_operator(operator: SymmetricOperator) -> LinearOperator:
-    """The operator as SciPy's; a product with k vectors stays one."""
+    """The operator as SciPy's; a product with k vectors is one product."""
     dtype = np.dtype(str(operator.dtype).removeprefix("torch."))
 
     def matmat(V: np.ndarray) -> np.ndarray:
@@ -234,7 +236,7 @@ def _eigenthings(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Metho
         )
 
     def sums(_: Case, operator: MeteredOperator, seed: int, starts: int, steps: int) -> list[Answer]:
-        # it seeds its start vectors one after the other: those of two seeds must not overlap
+        # its start vectors have consecutive seeds: those of two runs must not overlap
         options = {"num_runs": starts, "lanczos_steps": steps, "num_grid_points": 2, "seed": 1000 * seed}
         found = module.spectral_density(wrapped(operator), **options)
         kept = found.raw_weights > 0

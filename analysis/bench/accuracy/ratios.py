@@ -1,6 +1,6 @@
-"""Summaries of an accuracy study: a point a setting, and the defaults' work over others' at equal true error.
+"""Summaries of an accuracy study: a point for each setting, and the defaults' work over the rivals' at equal true error.
 
-See `analysis.bench.accuracy.command` for the definition; the numbers are those of its table of runs.
+`analysis.bench.accuracy.command` has the definitions; `table` is its table of runs, `floors` the round-off of each case.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,17 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-SCENES = {"traces": 0.5, "ends": 0.85}  # what the project promises of scenes and checkpoints, by quantity
-MATRICES = 1.1  # and of matrices, any quantity
+SCENES = {"traces": 0.5, "ends": 0.85}  # largest ratios that are asked for on scenes and checkpoints, by quantity
+MATRICES = 1.1  # the same on matrices, for every quantity
 DRAWS = 200  # of the bootstrap
 LIMITS = (0.025, 0.975)  # of a 95% interval
-MEANS = ("error", "needs", "rival_needs", "ratio", "seconds_ratio")  # of scenes together
+MEANS = ("error", "needs", "rival_needs", "ratio", "seconds_ratio")  # columns averaged over scenes
 QUANTITIES = ("traces", "ends", "sum of |lambda|", "effective rank", "mass quantile", "diagonal")
 SETTING = ["case", "family", "quantity", "origin", "method", "settings"]
 
 
 def points(table: pd.DataFrame, floors: Mapping[str, float]) -> pd.DataFrame:
-    """A line a setting: means over seeds and parts, root mean squares of errors."""
+    """A line for each setting: means over seeds and parts, of errors root mean squares."""
     table = table.assign(true_error=_squares(table, floors), reported_error=table["reported_error"].pow(2))
     columns = ["matvecs", "seconds", "true_error", "reported_error", "covered"]
     means = pd.DataFrame(table.groupby(SETTING, sort=False)[columns].mean()).reset_index()
@@ -27,14 +27,14 @@ def points(table: pd.DataFrame, floors: Mapping[str, float]) -> pd.DataFrame:
 
 
 def _squares(table: pd.DataFrame, floors: Mapping[str, float]) -> np.ndarray:
-    """Squared true errors, none below its case's round-off; what failed has an infinite one."""
+    """Squared true errors, at least the squared round-off of the case; infinite where the method failed."""
     floor = table["case"].map(lambda case: floors[case]).where(table["quantity"] != "precision", 0.0)
     return np.maximum(table["true_error"].fillna(np.inf).to_numpy(float), floor.to_numpy(float)) ** 2
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """The settings of one method.  squares, costs: (settings, seeds); a setting's error is the root of its mean square."""
+    """The settings of one method.  squares, costs: squared errors and costs, (settings, seeds)."""
 
     squares: np.ndarray
     costs: np.ndarray
@@ -46,16 +46,16 @@ class Curve:
         return cls(*grids)
 
     def drawn(self, rng: np.random.Generator | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Errors and costs of the settings over all seeds, or over as many drawn with replacement."""
-        seeds = self.costs.shape[1]  # fewer of our settings that are not the default
+        """Root mean square errors and mean costs of the settings: over all seeds, or over a bootstrap sample of them."""
+        seeds = self.costs.shape[1]
         chosen = np.arange(seeds) if rng is None else rng.integers(seeds, size=seeds)
         return np.sqrt(self.squares[:, chosen].mean(axis=1)), self.costs[:, chosen].mean(axis=1)
 
 
 def needed(errors: np.ndarray, costs: np.ndarray, goal: float) -> tuple[float, str]:
-    """Work that a method needs for an error, and whether it is exact (""), an upper ("≥" of a ratio) or a lower bound ("≤").
+    """Work that a method needs for an error, and the sign of the ratio's bound: "" exact, "≥" need may be less, "≤" more.
 
-    It has an error where none of its costlier settings has a larger one: see `analysis.bench.accuracy.command`.
+    A setting reaches an error if no costlier setting has a larger one (`analysis.bench.accuracy.command`).
 
     >>> errors, costs = np.array([1e-1, 1e-3]), np.array([10.0, 1000.0])
     >>> needed(errors, costs, 1e-2)[0].round(9), needed(errors, costs, 0.5), needed(errors, costs, 1e-9)
@@ -66,7 +66,7 @@ def needed(errors: np.ndarray, costs: np.ndarray, goal: float) -> tuple[float, s
     order = np.argsort(costs)
     costs, errors = costs[order], errors[order]
     worst = np.maximum.accumulate(np.where(np.isfinite(errors), errors, 0.0)[::-1])[::-1]
-    # a setting that failed says nothing of the cheaper ones, and costs what it costs for their error
+    # a setting that failed has the error of the cheaper ones, and does not raise theirs
     errors = np.minimum.accumulate(np.where(np.isfinite(errors), worst, np.inf))
     if goal >= errors[0]:
         return float(costs[0]), "≥" if goal > errors[0] else ""
@@ -80,9 +80,9 @@ def needed(errors: np.ndarray, costs: np.ndarray, goal: float) -> tuple[float, s
 
 
 def ratios(table: pd.DataFrame, floors: Mapping[str, float]) -> pd.DataFrame:
-    """A line a case, quantity and kind of rival ("peer", "own"): the default's matvecs and seconds over the best rival's.
+    """A line for each case, quantity and kind of rival ("peer", "own"): work of the default over that of the best rival.
 
-    Where there are several scenes, a line more for each quantity that they are asked for (`_together`).
+    With several scenes, also a line for all of them for each quantity in SCENES (`_together`).
     """
     table = table.assign(square=_squares(table, floors))
     rng, lines, drawn = np.random.default_rng(0), [], {}
@@ -107,7 +107,7 @@ def ratios(table: pd.DataFrame, floors: Mapping[str, float]) -> pd.DataFrame:
 
 
 def _together(found: Sequence[tuple[Mapping, np.ndarray]]) -> dict:
-    """The scenes' geometric means; a bound where one of them is a bound (which way, where they agree)."""
+    """The scenes' geometric means; a bound where any of them is one, "≈" where the signs differ."""
 
     def mean(values: Sequence) -> np.ndarray:
         return np.exp(np.log(values).mean(axis=0))
@@ -124,24 +124,24 @@ def _together(found: Sequence[tuple[Mapping, np.ndarray]]) -> dict:
 
 
 def _asked(family: str, quantity: str) -> float:
-    """Largest ratio that is asked for; nan: none."""
+    """Largest ratio that is asked for; nan without."""
     return MATRICES if family == "matrices" else SCENES.get(quantity, np.nan)
 
 
 def _compared(
     default: pd.DataFrame, rivals: pd.DataFrame, cost: str, rng: np.random.Generator
 ) -> tuple[dict, np.ndarray]:
-    """The ratio with the best rival, its bootstrap interval, and the two points compared; and the bootstrap's ratios."""
-    own = Curve.of(default, cost)
+    """The ratio with the best rival, its interval and the two points compared; and the ratios of the bootstrap."""
+    ours = Curve.of(default, cost)
     others = {str(name): Curve.of(runs, cost) for name, runs in rivals.groupby("estimator", sort=False)}
-    errors, costs = own.drawn()
+    errors, costs = ours.drawn()
     found = {name: needed(*curve.drawn(), errors[0]) for name, curve in others.items()}
     best = _best(found)
     draws = []
     for _ in range(DRAWS):
-        error, mine = own.drawn(rng)
+        error, needs = ours.drawn(rng)
         again = {name: needed(*curve.drawn(rng), error[0]) for name, curve in others.items()}
-        draws.append(mine[0] / again[_best(again)][0])
+        draws.append(needs[0] / again[_best(again)][0])
     low, high = np.quantile(draws, LIMITS)
     need, bound = found[best]
     compared = {
@@ -152,12 +152,12 @@ def _compared(
 
 
 def _best(found: Mapping[str, tuple[float, str]]) -> str:
-    """Name of the method that needs least; methods whose settings end above the error count only where all do."""
+    """Name of the method that needs least; methods that do not reach the error count only where none does."""
     return min(found, key=lambda name: (found[name][1] == "≤", found[name][0] * (-1 if found[name][1] == "≤" else 1)))
 
 
 def verdict(line: Mapping[str, object], asked: float) -> str:
-    """ "yes" or "no" where interval and bound leave no doubt."""
+    """ "yes" or "no" where interval and bound decide, else "open"; "" where no ratio is asked for."""
     low, high, bound = float(line["low"]), float(line["high"]), line["bound"]  # pyright: ignore[reportArgumentType]
     if np.isnan(asked):
         return ""

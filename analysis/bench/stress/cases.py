@@ -1,8 +1,8 @@
 """Scenes at the limits of the renderer, a few Gaussians and pixels each, and inputs that it has to refuse.
 
-Every parameter is a float32 number held in float64, so that both precisions begin at the same point.  A scene with thresholds
-is drawn again, with the next seed, until no pixel lies within MARGIN of alpha_min or of the transmittance at which it stops:
-both precisions then make the same decisions, and what is left is round-off.
+Every parameter is a float32 number stored in float64, so that both precisions start at the same point.  A scene is drawn again,
+with the next seed, until no pixel lies within MARGIN of alpha_min or transmittance_min: both precisions then make the same
+decisions, and differ by round-off alone.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,10 +31,10 @@ Change = Callable[[dict[str, Tensor]], None]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One scene, one view.  gaussians: in float64; target: the picture it is compared with.
+    """A scene with one view.  gaussians: in float64; target: the photograph.
 
-    dense: whether it is small enough for a dense Hessian.  stand_in: a scene of the same derivatives, to many digits, on which
-    the specification can be evaluated where it cannot be on this one.
+    dense: whether it is small enough for a dense Hessian.  stand_in: where the specification cannot be evaluated, a scene with
+    the same derivatives, to many digits, on which it can.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Refusal:
-    """An input that must raise ValueError with these words in it."""
+    """An input that must raise a ValueError whose message has these words."""
 
     name: str
     gaussians: Gaussians
@@ -168,7 +168,7 @@ def cases(seed: int) -> Iterator[Case]:
 
 
 def refusals(seed: int) -> Iterator[Refusal]:
-    """Inputs that no number may come of; Gaussian 1 is the bad one."""
+    """Inputs that must be refused; Gaussian 1 is the bad one."""
 
     def bad(name: str, attribute: str, value: object) -> Refusal:
         change = set_rows(attribute, value, 1)

@@ -1,26 +1,28 @@
 """The stress study: image, first and second derivatives at the limits of the renderer, against float64 and stated bounds.
 
-OUT/stress.csv   a line a case, quantity, attribute and precision: error, bound, norm of the truth, verdict
+OUT/stress.csv   a line for each case, quantity, attribute and precision: error, bound, norm of the truth, verdict
 
 The truth is the plain torch specification in float64, differentiated by autograd (H as a dense matrix).  The bound of a
-quantity Q follows from its condition K(Q), what a relative change of every intermediate number does to it
-(`stress_condition`):
+quantity Q follows from its condition K(Q), the change of Q by relative changes of all intermediate numbers
+(`analysis.bench.stress.condition`):
 
     bound = (4 sqrt(k / 3) (u + u64) + e) K(Q)        k = 8 + 3 n roundings between two stages, u half an eps
 
 A rounding is uniform in +-u, of variance u^2 / 3; k of them add like a random walk: eight of an exponent, three of each of n
-Gaussians over a pixel.  Four standard deviations; u64 is for the specification's own rounding, e the error of the kernels'
-2^x.  Norms are taken over the rows of an attribute.  Where things vanish the smallest normal number is added, once a pixel.
+Gaussians over a pixel.  The bound is four standard deviations; u64 is the rounding of the specification, e the error of the
+kernels' 2^x.  Norms are over the rows of an attribute.  The smallest normal number is added once a pixel, for quantities that
+vanish.  K and factors of the quantities, with the error D of the operator:
 
-    image, gradient        their own K
-    H v, Gauss-Newton v    theirs, v random signs
-    own blocks             C K of H_b z, b an attribute's rows and columns: E |D z|^2 = |D|_F^2, over that of own blocks
+    image, gradient        K of the quantity
+    H v, Gauss-Newton v    K of the quantity, v random signs
+    own blocks             the diagonal block of every Gaussian and attribute: C K of H_b z, b the attribute's rows and columns,
+                           z random signs: E |D z|^2 = |D|_F^2, which bounds that of the Gaussians' blocks
     traces                 the same times sqrt(dim): |tr D| <= sqrt(dim) |D|_F
     ends of the spectrum   |d lambda| <= |D|_2 <= |D|_F (Weyl), and the residual that Lanczos reports
 
-C is what sums of moments lose (`cancellation`).  Blocks and traces are those of the pixel loss alone, where `block_diagonal`
-and `exact_traces` are exact; the others have SSIM.  Where the specification cannot say (`stand_in`; a crowd's dense H) float32
-is compared with the float64 kernels.
+C is the cancellation in sums of moments (`cancellation`).  Blocks and traces are those of the pixel loss alone, where
+`block_diagonal` and `exact_traces` are exact; the others are with SSIM.  Where the specification cannot be evaluated
+(`Case.stand_in`; the dense H of a crowd) float32 is compared with the float64 kernels.
 """
 
 from dataclasses import dataclass
@@ -92,7 +94,7 @@ class Scene:
         return cls(objective(WITH_SSIM), objective(PIXELS_ALONE))
 
     def gaussian_blocks(self) -> dict[str, Tensor]:
-        """The own blocks of every attribute, (n, d, d); of SH the diagonal."""
+        """The diagonal blocks of every Gaussian, by attribute, (n, d, d); of SH the diagonal."""
         blocks = self.pixels.block_diagonal()
         result = {name: blocks.geometry[:, part, part].double() for name, part in GEOMETRY_COLUMNS.items()}
         return {**result, "sh": blocks.sh.double()}
@@ -140,7 +142,7 @@ class Study:
         self.record(quantity, attribute, precision, got, truth, self.round_off(precision) * condition + least)
 
     def round_off(self, precision: str) -> float:
-        """The bound over K."""
+        """The factor of K in the bound."""
         info, n = torch.finfo(PRECISIONS[precision]), len(self.point)
         u = (info.eps + torch.finfo(torch.float64).eps) / 2
         return 4 * sqrt((8 + 3 * n) / 3) * u + EXP2_ERROR[info.bits]
@@ -156,7 +158,7 @@ class Study:
         return self.findings
 
     def with_ssim(self) -> None:
-        """Image, gradient, products and, where H can be made dense, the ends of its spectrum."""
+        """Image, gradient, products and, where H fits as a dense matrix, the ends of its spectrum."""
         condition = Condition.of(self.case, self.measured_at, WITH_SSIM, self.U[:, :1], self.seed)
         kernels = self.scenes["float64"]
         if self.case.stand_in is None:
@@ -177,7 +179,7 @@ class Study:
                 self.ends(precision, condition("products"))
 
     def ends(self, precision: str, condition: float) -> None:
-        """The ends that Lanczos finds, against those of the dense H (of the float64 kernels' for a stand-in)."""
+        """The ends by Lanczos, against those of the dense H: of the specification, or of the float64 kernels for a stand-in."""
         exact = SceneHessian(self.scenes["float64"].smooth)
         identity = torch.eye(exact.dim, dtype=torch.float64)
         if self.case.stand_in is None:
@@ -193,7 +195,7 @@ class Study:
             self.record("spectrum", name, precision, pairs.values[0], value, bound + float(pairs.residuals[0]))
 
     def pixels_alone(self) -> None:
-        """Own blocks and exact traces, of the pixel loss."""
+        """Diagonal blocks and exact traces of the pixel loss."""
         condition = Condition.of(self.case, self.measured_at, PIXELS_ALONE, self.U, self.seed)
         cancels = cancellation(self.case, self.measured_at)
         dense = None
@@ -203,10 +205,10 @@ class Study:
         truth = self.scenes["float64"].gaussian_blocks() if dense is None else self.dense_blocks(dense)
         traces = self.traces("float64") if dense is None else self.dense_traces(truth)
         for precision in self.compared if dense is not None else ["float32"]:
-            own, sums = self.scenes[precision].gaussian_blocks(), self.traces(precision)
+            blocks, sums = self.scenes[precision].gaussian_blocks(), self.traces(precision)
             for i, (name, rows) in enumerate(self.blocks.items()):
                 K = cancels * condition("products", (rows, i + 1))
-                self.judge("own blocks", name, precision, own[name], truth[name], K)
+                self.judge("own blocks", name, precision, blocks[name], truth[name], K)
                 self.judge("traces", name, precision, sums[name], traces[name], sqrt(rows.stop - rows.start) * K)
 
     def traces(self, precision: str) -> dict[str, Tensor]:
@@ -237,8 +239,7 @@ def refused(refusal: Refusal) -> Finding:
         SceneObjective(refusal.gaussians.to(torch.float32), [view], WITH_SSIM, BACKGROUND, case.settings)
     except ValueError as error:
         message = str(error)
-    held = all(word in message for word in refusal.words)
-    verdict = "refused" if held else "not refused"
+    verdict = "refused" if all(word in message for word in refusal.words) else "not refused"
     return Finding(refusal.name, "a clear error", "", "float32", nan, nan, nan, verdict, message)
 
 
@@ -246,13 +247,13 @@ def refused(refusal: Refusal) -> Finding:
 
 
 def run_stress(options: BenchOptions) -> int:
-    """Run every case, print the worst of each, write OUT/stress.csv; 1 if any bound is exceeded, else 0."""
+    """Run every case, print the worst of each, write OUT/stress.csv; returns 1 if any bound is exceeded, else 0."""
     console, errors = Console(), Console(stderr=True)
     findings: list[Finding] = []
     todo = list(cases(SEED))
     for number, case in enumerate(track(todo, "stress (first compiling)", console=errors, transient=True), 1):
         findings += Study(case, SEED).run()
-        if not errors.is_terminal:  # a log has no bar
+        if not errors.is_terminal:  # where no progress bar is drawn
             say(f"{number} of {len(todo)}: {case.name}", console=errors)
     findings += [refused(refusal) for refusal in refusals(SEED)]
     table = pd.DataFrame(vars(finding) for finding in findings)
@@ -265,7 +266,7 @@ def run_stress(options: BenchOptions) -> int:
 
 
 def worst(table: pd.DataFrame) -> pd.DataFrame:
-    """A line a case and precision: the quantity nearest to its bound; and every one that missed it."""
+    """The quantity nearest to its bound of each case and precision, and every one that exceeds it."""
     share = (table["error"] / table["bound"]).fillna(0.0)
     nearest = share.groupby([table["case"], table["precision"]]).transform("idxmax") == table.index
     what = (table["quantity"] + " " + table["attribute"]).str.strip()

@@ -1,14 +1,13 @@
 """The plain torch specification in float64, by autograd, exact and with every intermediate number perturbed.
 
-`Condition` measures what the perturbations do to a quantity Q: with every number that one stage hands to the next (parameters,
-splats, the three terms of the exponent and alpha in every pixel, pixels, the blurs of SSIM) multiplied by 1 + d s, s random
-signs (autograd runs the adjoints through the same factors),
+`Condition` measures the effect of perturbations on a quantity Q.  Every number that one stage passes to the next (parameters,
+splats, the three terms of the exponent and alpha in every pixel, pixels, the blurs of SSIM) is multiplied by 1 + d s, s random
+signs; autograd passes the adjoints through the same factors:
 
     K(Q) = sqrt(mean |Q(d) - Q|^2) / d sqrt(DRAWS / chi^2)        over DRAWS draws of signs, d = STEP
 
-chi^2: the 1% quantile with DRAWS degrees of freedom.  Where a few signs decide, as for needles, the mean is no better known.
-
-The order of the splats is held; the thresholds are those of a scene that has no pixel near them (`stress_cases`).
+chi^2: the 1% quantile with DRAWS degrees of freedom, for the sampling error of the mean where few signs dominate it, as for
+needles.  The order of the splats is fixed; no pixel is near a threshold (`analysis.bench.stress.cases`).
 """
 
 from collections.abc import Callable
@@ -35,7 +34,7 @@ def exactly(x: Tensor) -> Tensor:
 
 
 def roundings(seed: int) -> Rounded:
-    """x -> x (1 + STEP s), s random signs: the relative error of every number, of a known size."""
+    """x -> x (1 + STEP s), s random signs: a relative error of known size in every number."""
     generator = torch.Generator().manual_seed(seed)
 
     def rounded(x: Tensor) -> Tensor:
@@ -46,7 +45,7 @@ def roundings(seed: int) -> Rounded:
 
 
 def specified_loss(image: Tensor, target: Tensor, loss: LossSettings, rounded: Rounded) -> Tensor:
-    """`losses.photometric_loss` with roundings of the blurs."""
+    """`losses.photometric_loss`, with `rounded` applied to the blurs and their arguments."""
     value = loss.pixel_weight * pixel_loss(image, target, loss.pixel, loss.eps)
     if not loss.ssim_weight:
         return value
@@ -68,7 +67,7 @@ class Specified:
 
 
 def composited(splats: Splats, case: Case, rounded: Rounded) -> Tensor:
-    """The image of `reference.rasterize_reference`, in one tile, with roundings in every pixel."""
+    """The image of `reference.rasterize_reference`, in one tile, with `rounded` applied in every pixel."""
     order = torch.argsort(splats.depths, stable=True)
     order = order[splats.drawn[order]]
     x, y = torch.arange(case.camera.width) + 0.5, torch.arange(case.camera.height) + 0.5
@@ -89,7 +88,7 @@ def composited(splats: Splats, case: Case, rounded: Rounded) -> Tensor:
 
 
 def specified(case: Case, point: Gaussians, loss: LossSettings, U: Tensor, rounded: Rounded | None = None) -> Specified:
-    """The specification's values and derivatives, or, given roundings, perturbed ones."""
+    """The specification's values and derivatives; perturbed by `rounded` where given."""
     camera, target, flat = case.camera, case.target.double(), point.flat.clone().requires_grad_()
     if rounded is None:
         rounded, size = exactly, (camera.width, camera.height)
@@ -98,23 +97,23 @@ def specified(case: Case, point: Gaussians, loss: LossSettings, U: Tensor, round
     else:
         splats = project(point.with_flat(rounded(flat)), camera, case.settings)
         parts = {name: rounded(getattr(splats, name)) for name in ("means", "conics", "opacities", "colours")}
-        exact = project(point, camera, case.settings)  # the order is a decision
+        exact = project(point, camera, case.settings)  # for the order and the set of drawn splats
         image = rounded(composited(replace(exact, **parts), case, rounded))
     (gradient,) = torch.autograd.grad(specified_loss(image, target, loss, rounded), flat, create_graph=True)
     (products,) = torch.autograd.grad(gradient, flat, U.T, is_grads_batched=True, retain_graph=True)
     weight = torch.zeros_like(image, requires_grad=True)
-    (pulled,) = torch.autograd.grad(image, flat, weight, create_graph=True)
-    (along,) = torch.autograd.grad(pulled, weight, U[:, 0], retain_graph=True)
-    held = image.detach().requires_grad_()
-    (slope,) = torch.autograd.grad(specified_loss(held, target, loss, rounded), held, create_graph=True)
-    (bent,) = torch.autograd.grad(slope, held, along)
-    (gauss_newton,) = torch.autograd.grad(image, flat, bent)
+    (vjp,) = torch.autograd.grad(image, flat, weight, create_graph=True)
+    (jvp,) = torch.autograd.grad(vjp, weight, U[:, 0], retain_graph=True)
+    pixels = image.detach().requires_grad_()
+    (slope,) = torch.autograd.grad(specified_loss(pixels, target, loss, rounded), pixels, create_graph=True)
+    (cotangent,) = torch.autograd.grad(slope, pixels, jvp)
+    (gauss_newton,) = torch.autograd.grad(image, flat, cotangent)
     return Specified(image.detach(), gradient.detach(), products.T, gauss_newton)
 
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """(Q(d) - Q) / d of every quantity, one a draw of signs."""
+    """(Q(d) - Q) / d of every quantity, for each draw of signs."""
 
     draws: list[Specified]
 
@@ -132,10 +131,10 @@ class Condition:
 
 
 def cancellation(case: Case, point: Gaussians) -> float:
-    """Largest cancellation over the splats where a block is summed from moments of the offsets d = (x, y).
+    """C: largest cancellation over the splats in blocks that are summed from moments of the offsets d = (x, y).
 
-    sum w (Q d)^2 is taken from sum w x^2, ..., whose terms are as large as (|Q| |d|)^2, against |Q d|^2 <= |Q| d.Q d: a
-    factor of |Q| |d|^2 / d.Q d, at the edge of the splat (its level, 2 ln(o / alpha_min)) and within the image.
+    sum w (Q d)^2 is computed from sum w x^2, ..., whose terms are as large as (|Q| |d|)^2, while |Q d|^2 <= |Q| d.Q d: a
+    factor of |Q| |d|^2 / d.Q d, at the edge of the splat (level d.Q d = 2 ln(o / alpha_min)) and within the image.
     """
     splats = project(point, case.camera, case.settings)
     a, b, c = splats.conics[splats.drawn].T

@@ -1,16 +1,16 @@
-"""`landscape map`: where a checkpoint's loss is curved, as numbers of every Gaussian and as pictures over the training views.
+"""`landscape map`: where a checkpoint's loss is curved, as numbers of every Gaussian and as pictures of the training views.
 
     fields.ply          the Gaussians as 3DGS writes them, and every field (`splat.curvature.fields`) as a property of its
                         name; nan where no view sees a Gaussian
     FIELD.ply           the Gaussians in the colours of one field, grey where it has no value; opens in every viewer
-    top.csv             the hundred Gaussians with most of it
+    top.csv             the hundred Gaussians with the largest values of that field
     view-NNN.png        each training view: photograph, render, error, and the field composited with the splats' weights
     fragility-NNN.png   each training view: where it is fragile in position, conditioning and opacity
     steepest-*.png      with a probe beside the checkpoint: the Gaussians that carry both ends of the spectrum
-    map.json            what the pictures show and where it comes from; NAME.npz: the pictures' maps, in bytes
+    map.json            the record (`MapRecord`); NAME.npz: the pictures' maps, in bytes
 
-Blocks and sights are taken on the CPU.  The ends of a map's scale are percentiles over the Gaussians in sight, by their weight
-in the images.
+Everything is computed on the CPU.  The ends of a map's scale are percentiles over the Gaussians in sight, by their weight in
+the images.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,14 +50,14 @@ from splat.render.sight import Sight
 from splat.scenes.view import View
 from splat.training.checkpoint import Checkpoint
 
-ENDS = {"e1": "share of e₁", "e_min": "share of eₘᵢₙ"}
+ENDS = {"e1": "e₁", "e_min": "eₘᵢₙ"}  # fields of a probe's eigenvectors: the share of each in a Gaussian
 AXES = ("order_gap", "condition", "one_view")  # of fragility
 PROBE = "probe"
 
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """Every field of the Gaussians in sight, and what it is; ends: of the spectrum that a probe recorded, by name."""
+    """Fields of the Gaussians in sight, with their kinds.  ends: of the spectrum that a probe recorded, by field."""
 
     values: Values
     kinds: Mapping[str, Field]
@@ -69,7 +69,7 @@ class Fields:
         return self.values["weight"].numpy()
 
     def shade(self, name: str) -> Shade:
-        """The scale of a field; that of the share in one view runs from equal parts to all."""
+        """The scale of a field; of `one_view` from 1 / views, equal weights, to 1."""
         kind, views = self.kinds[name], len(self.sights)
         shade = Shade.of(name, kind.words, kind.unit, kind.scale, self.values[name].numpy(), self.weight)
         return structs.replace(shade, low=1 / views, high=1.0) if name == "one_view" and views > 1 else shade
@@ -87,7 +87,7 @@ def in_words(kind: Field, value: float) -> str:
 
 def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
     """Map the checkpoint; returns the exit code.  command: as typed, for the record; drawn: draws the pictures."""
-    out = options.out or options.checkpoint.parent / MAP
+    out, probe = options.out or options.checkpoint.parent / MAP, options.checkpoint.parent / PROBE
     known = [*FIELDS, *ENDS]
     if options.shown not in known:
         raise InputError(
@@ -102,13 +102,14 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         chosen = _chosen(options.draw, objective.views)
     with record_folder(out, MapRecord.FILE) as folder, stages, ThreadPoolExecutor(1) as beside:
         with stages.stage("fields") as report:
-            found = measured_fields(objective, options.checkpoint.parent / PROBE, notes, report)
+            found = measured_fields(objective, probe, notes, report)
         if options.shown not in found.values:
             raise InputError(
-                f"expected a probe with eigenvectors of this checkpoint in {options.checkpoint.parent / 'probe'} for "
-                f"--field {options.shown}, got none; run landscape probe first"
+                f"expected a probe with eigenvectors of this checkpoint in {probe} for --field {options.shown}, got none; "
+                "run landscape probe first"
             )
-        swapping = beside.submit(_fragility, objective, found, options.seed)  # no stage fills two processors by itself
+        # beside the next stages, none of which uses more than one processor
+        swapping = beside.submit(_fragility, objective, found, options.seed)
         with stages.stage("maps") as report:
             shades = {name: found.shade(name) for name in dict.fromkeys((options.shown, *AXES))}
             panels = _write_panels(folder, objective, found, shades, chosen, report)
@@ -136,15 +137,15 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         data.timing = {**stages.timing, "total": perf_counter() - start}
         _write(folder, data)
     if found.ends:
-        from analysis.records.report import write_report  # a quarter of a second of imports
+        from analysis.records.report import write_report  # slow to import
 
-        write_report(options.checkpoint.parent / PROBE)  # its page has the map's pictures too
+        write_report(probe)  # its page shows the map's pictures
     _conclude(data, {name: column[0] for name, column in top.items()}, found.kinds[options.shown], out)
     return 0
 
 
 def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
-    """Places of the views that are drawn."""
+    """Indices of the views named, by file name, full name or index; by default all."""
     places = {view.name: i for i, view in enumerate(views)} | {Path(view.name).name: i for i, view in enumerate(views)}
     places |= {str(i): i for i in range(len(views))}
     if unknown := [name for name in names if name not in places]:
@@ -155,7 +156,7 @@ def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
 
 
 def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
-    """Fields of the blocks and the views, and the masses in the eigenvectors of the probe, where it is of this loss here."""
+    """Fields of the blocks and the views, and masses in the eigenvectors of the probe, where that is of the same loss."""
     values, sights = scene_fields(objective, report)
     ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, objective, notes)
     if recorded is not None:
@@ -167,11 +168,9 @@ def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], re
         for name, (group, end, title) in known.items():
             if group in vectors and vectors[group].shape[1] and end.value:
                 title = "the most negative direction" if end.value < 0 else title
-                ends[name] = End(
-                    ENDS[name][len("share of ") :], title, torch.from_numpy(vectors[group][:, 0]), end.value
-                )
+                ends[name] = End(ENDS[name], title, torch.from_numpy(vectors[group][:, 0]), end.value)
                 values[name] = masses(ends[name].vector, objective.active)
-                kinds[name] = Field(ENDS[name], "", "log")
+                kinds[name] = Field(f"share of {ENDS[name]}", "", "log")
     return Fields(values, kinds, ends, sights)
 
 
@@ -189,7 +188,7 @@ def _write_panels(
     chosen: Sequence[int],
     report: Progress,
 ) -> list[Panel]:
-    """The maps of the chosen views; the scale of their errors, which all views have in common, is added to the shades."""
+    """Write the maps of the chosen views; adds to the shades the scale of the error, which all views share."""
     names, panels = list(shades), []
     shares = {name: torch.from_numpy(shades[name].share(found.values[name].numpy())) for name in names}
     shades["error"] = error_shade(objective)
@@ -203,7 +202,7 @@ def _write_panels(
 
 
 def _write_ends(folder: Path, objective: SceneObjective, found: Fields, report: Progress) -> list[Steepest]:
-    """The ends of the spectrum that are known, with their pictures."""
+    """The known ends of the spectrum; writes their pictures."""
     shown = []
     for done, (name, end) in enumerate(found.ends.items()):
         one, pictures = steepest(objective, end, found.values, found.sights, f"steepest-{name}")

@@ -1,11 +1,11 @@
-"""`landscape claims`: the paper's statements against the runs of a study.
+"""`landscape claims`: verdicts on the paper's statements from the runs of a study.
 
-OUT/study.csv        the runs (`analysis.runs.claims.study`); the command takes this file instead of the runs, too
+OUT/study.csv        the runs (`analysis.runs.claims.study`); the command accepts this file in place of the runs
 OUT/claims.csv       the effects behind each verdict (`analysis.runs.claims.statements`)
-OUT/predictors.csv   which quantity goes with the score (`analysis.runs.claims.predictors`)
+OUT/predictors.csv   correlation of quantities with the score (`analysis.runs.claims.predictors`)
 OUT/claims.json      the nine judgements
 OUT/claims.png, claim-N.png, predictors.png   drawn by `figures.claims`
-OUT/claims.html      all of it on a page that needs no network
+OUT/claims.html      all of it on a self-contained page
 """
 
 from collections.abc import Sequence
@@ -70,7 +70,7 @@ def render_page(rows: pd.DataFrame, found: Sequence[Judgement], out: Path) -> st
     """The page as text, with the pictures that lie in the folder."""
     template = template_environment().get_template("claims.html.jinja")
     words = {f"claim-{each.number}": f"{each.statement} {each.verdict}: {each.finding}" for each in found}
-    own = {each["name"]: each for each in pictures_in(out, words)}
+    drawn = {each["name"]: each for each in pictures_in(out, words)}
     return template.render(
-        judgements=found, own=own, runs=runs_of(rows).to_dict("records"), pictures=pictures_in(out, PICTURES)
+        judgements=found, own=drawn, runs=runs_of(rows).to_dict("records"), pictures=pictures_in(out, PICTURES)
     )

@@ -27,7 +27,7 @@ BASE, STABLE = "3dgs", "stablegs"
 SCORE = "psnr"
 STRETCHED = ("quats", "log_scales")  # attributes whose curvature the paper ascribes to needles
 PAIR = ("scene", "seed")
-SURROUNDINGS = ("machine", "threads")  # in which times have to agree to be compared
+SURROUNDINGS = ("machine", "threads")  # columns that must agree for times to be compared
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Effect:
 
 
 def decide(effect: Effect) -> Verdict:
-    """The verdict of the table above; the claim is an effect on the side of `null` where `claimed` lies, or above it.
+    """The verdict by the module's table.  The claimed effect is on the side of `null` where `claimed` lies, by default above.
 
     >>> decide(Effect("", Interval(1.2, 1.0, 1.4, 3), 0.0, 1.3)), decide(Effect("", Interval(0.5, 0.3, 0.7, 3), 0.0, 1.3))
     ('holds', 'holds in part')
@@ -104,7 +104,7 @@ def decide(effect: Effect) -> Verdict:
 
 
 def numbers(rows: pd.DataFrame, name: str, method: str | None = None, keys: Sequence[str] = PAIR) -> pd.Series:
-    """A quantity by keys: of every run, or the means of one method's runs with the same keys; empty where no run has it."""
+    """A quantity by keys: of every run, or of one method, whose runs with the same keys are averaged.  Without missing ones."""
     values = np.asarray(rows[name], float) if name in rows else np.full(len(rows), np.nan)
     known = np.isfinite(values)
     if method is not None:
@@ -114,7 +114,7 @@ def numbers(rows: pd.DataFrame, name: str, method: str | None = None, keys: Sequ
 
 
 def _means(values: pd.Series, keys: Sequence[str]) -> pd.Series:
-    """Of those with the same keys."""
+    """Means over entries with the same keys."""
     return values if values.index.is_unique else pd.Series(values.groupby(level=list(keys)).mean())
 
 

@@ -1,12 +1,12 @@
 """Correlation of measured quantities with the score on held-out views, over all trainings of a study.
 
-    rho         Spearman's rank correlation with PSNR
-    all         over the runs of each scene, ranked within it
-    within      after each method's mean rank was taken away: what the seeds of one method say
+    rho         Spearman's rank correlation with PSNR, of one of these kinds:
+    all         of the runs, ranked within each scene
+    within      of these ranks minus their mean over the method: between the seeds of one method
     between     of the methods' means
 
-Each with a 95% interval from a bootstrap, which draws runs (between: methods) with replacement.  Correlation is not cause: the
-runs differ in method, and so in everything at once.
+Each with a 95% interval from a bootstrap, which draws runs (between: methods) with replacement.  Correlation does not imply
+cause: methods differ in many quantities at once.
 """
 
 from collections.abc import Iterator
@@ -27,9 +27,10 @@ DRAWS, LIMITS, LEAST = 2000, (0.025, 0.975), 5
 
 
 def predictors(rows: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
-    """A row for each quantity and kind: quantity, kind, rho, low, high, n.  Fewer than LEAST runs or methods give none.
+    """A row for each quantity and kind: quantity, kind, rho, low, high, n.
 
-    Nor does a quantity that most runs lack: it would be compared with others over other runs than theirs.
+    Left out: kinds with fewer than LEAST runs or methods, and quantities that most runs lack, as the others' correlations would
+    be over different runs.
     """
     rng = np.random.default_rng(seed)
 

@@ -1,6 +1,6 @@
 """The paper's nine statements, each judged by the effects that decide it (`analysis.runs.claims.effects`).
 
-Sizes are the paper's, at 10,000 steps.  Of several effects the first decides, but where a statement says otherwise.
+Claimed sizes are the paper's, at 10,000 steps.  Of several effects the first decides, unless a docstring says otherwise.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -29,14 +29,14 @@ from analysis.runs.claims.effects import (
 
 ATTRIBUTES_ALONE, VIEWPOINTS_ALONE = "stablegs vsp_weight=0", "stablegs asp_weight=0"
 AXIS = ATTRIBUTES_ALONE + " probe.attributes={}"
-TIME = 1.45
-CLAIMED_VIEWS = 3  # of the gains in dB
-SUFFICIENT = 0.1  # relative standard error of a trace: rho, its root, is then known to 5%
+TIME = 1.45  # largest ratio of times that agrees with the paper's 1.3
+CLAIMED_VIEWS = 3  # training views of the claimed gains in dB
+SUFFICIENT = 0.1  # relative standard error of a trace, and so 5% of its square root rho
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """statement: the paper's, with its place.  finding: what was measured, in a sentence.  effects: the first decides."""
+    """The verdict on a statement.  source: its place in the paper.  finding: the measured effects in a sentence."""
 
     number: int
     statement: str
@@ -49,13 +49,10 @@ class Judgement:
 def anisotropy(rows: pd.DataFrame) -> Judgement:
     effects = []
     for name in INDICES:
-        sign = -1 if name == "effective_rank" else 1  # the more directions, the less anisotropic
+        sign = -1 if name == "effective_rank" else 1  # a larger rank is less anisotropic
         effects.append(ratio_effect(name.replace("_", " "), sign * log_ratios(rows, name), 0.26))
-    verdicts: list[Verdict] = [decide(effect) for effect in effects]
-    verdict = verdicts[0]
-    against = [
-        effect.name for effect, found in zip(effects, verdicts) if found == "does not hold" or effect.interval.low > 1
-    ]
+    against = [each.name for each in effects if decide(each) == "does not hold" or each.interval.low > 1]
+    verdict = decide(effects[0])
     if verdict == "holds" and against:
         verdict = "holds in part"
     finding = f"StableGS multiplies the literal index by {effects[0].interval.text()}; 74% less would be 0.26."
@@ -70,18 +67,12 @@ def depth(rows: pd.DataFrame) -> Judgement:
     ratios = pd.Series(np.log(numbers(rows, "depth_gradient")))
     effect = ratio_effect("depth / lateral gradient", ratios, 100.0)
     finding = f"Along the rays the positions' gradient is {effect.interval.text()} times that across them, over all trainings."
-    return Judgement(
-        2,
-        "The gradient along the depth is typically 100 times the lateral one.",
-        "Sec. 3.2",
-        decide(effect),
-        finding,
-        (effect,),
-    )
+    statement = "The gradient along the depth is typically 100 times the lateral one."
+    return Judgement(2, statement, "Sec. 3.2", decide(effect), finding, (effect,))
 
 
 def needles(rows: pd.DataFrame) -> Judgement:
-    """Judge by the curvature of both attributes; where no map has these, by the steepest eigenvector of the whole Hessian."""
+    """Decided by the curvature of both attributes; without a map, by the steepest eigenvector of the whole Hessian."""
     number = Interval.of(numbers(rows, "needle_count", BASE))
     null = number.value if number.n else 0.0
     blocks = {f"share of the curvature of {attribute_name(name)} on needles": f"needles_{name}" for name in STRETCHED}
@@ -105,13 +96,8 @@ def needles(rows: pd.DataFrame) -> Judgement:
 def position(rows: pd.DataFrame) -> Judgement:
     axes = {name: gains(rows, AXIS.format(name)) for name in ATTRIBUTES}
     whole = gains(rows, ATTRIBUTES_ALONE)
-    share = Effect(
-        "gain of positions alone - half of all attributes'",
-        Interval.of((axes["means"] - whole / 2).dropna()),
-        0.0,
-        None,
-        "dB",
-    )
+    surplus = Interval.of((axes["means"] - whole / 2).dropna())
+    share = Effect("gain of positions alone - half of all attributes'", surplus, 0.0, None, "dB")
     gain = Effect("gain of positions alone", Interval.of(axes["means"]), 0.0, 2.46, "dB")
     verdict = decide(gain) if gain.interval.n < LEAST or decide(gain) == "does not hold" else decide(share)
     known = {name: Interval.of(found) for name, found in axes.items() if len(found)}
@@ -133,31 +119,20 @@ def opacity(rows: pd.DataFrame) -> Judgement:
         f"Rank correlation of a Gaussian's curvature in opacity with the share of its weight that one view alone sees: "
         f"{effect.interval.text()}."
     )
-    return Judgement(
-        5,
-        "High curvature in opacity goes with view-specific opacities.",
-        "Sec. 3.2",
-        decide(effect),
-        finding,
-        (effect,),
-    )
+    statement = "High curvature in opacity goes with view-specific opacities."
+    return Judgement(5, statement, "Sec. 3.2", decide(effect), finding, (effect,))
 
 
 def samples(rows: pd.DataFrame) -> Judgement:
-    """Ten samples suffice where the largest error that a trace can have is small, not where only the least is."""
-    words, columns = ("least", "largest"), ("hutchinson_{}", "hutchinson_{}_most")
-    effects = [
-        Effect(
-            f"{attribute_name(each)}, {word} relative error of the trace",
-            Interval.of(pd.Series(np.log(numbers(rows, name)))).exp(),
-            SUFFICIENT,
-            0.0,
-        )
-        for word, column in zip(words, columns)
-        for each in ATTRIBUTES
-        if (name := column.format(each)) in rows
-    ]
-    least, most = ([effect for effect in effects if f", {word} " in effect.name] for word in words)
+    """Holds where the upper bound of every trace's error is at most SUFFICIENT, not where a lower bound exceeds it."""
+
+    def errors(word: str, column: str) -> list[Effect]:
+        found = {each: column.format(each) for each in ATTRIBUTES if column.format(each) in rows}
+        means = {each: Interval.of(pd.Series(np.log(numbers(rows, name)))).exp() for each, name in found.items()}
+        words = "{}, {} relative error of the trace"
+        return [Effect(words.format(attribute_name(each), word), mean, SUFFICIENT, 0.0) for each, mean in means.items()]
+
+    least, most = errors("least", "hutchinson_{}"), errors("largest", "hutchinson_{}_most")
     enough = len(most) == len(ATTRIBUTES) and all(effect.interval.n >= LEAST for effect in least + most)
     verdict: Verdict = "cannot be tested here"
     if enough and all(effect.interval.high <= SUFFICIENT for effect in most):
@@ -171,7 +146,7 @@ def samples(rows: pd.DataFrame) -> Judgement:
             f"{bound.interval.text()} ({bound.name.split(',')[0]})" for bound in bounds
         )
         finding += f"; {SUFFICIENT:.0%} counts as sufficient."
-    effects = effects or [Effect("largest relative error of a trace", Interval.of([]), SUFFICIENT, 0.0)]
+    effects = [*least, *most] or [Effect("largest relative error of a trace", Interval.of([]), SUFFICIENT, 0.0)]
     return Judgement(6, "Ten random probes suffice for the traces.", "Eq. (6)", verdict, finding, tuple(effects))
 
 
@@ -217,7 +192,7 @@ def cost(rows: pd.DataFrame) -> Judgement:
 
 
 def _within(time: Interval) -> bool | None:
-    """Whether it is at most TIME, some ten percent more than the paper's 1.3; None: not decided."""
+    """Whether a ratio of times is at most TIME; None: not decided."""
     return None if time.n < LEAST or time.low <= TIME < time.high else time.high <= TIME
 
 

@@ -1,23 +1,22 @@
-"""The runs of a study as a table: a row for each, which `landscape claims` reads and keeps as OUT/study.csv.
+"""The runs of a study as a table, OUT/study.csv of `landscape claims`: a row for each run.
 
-    scene, method, seed         where the row belongs; method: its name and the settings that were changed, as in
-                                "stablegs vsp_weight=0"
-    steps, views, size          of the training; how many views it was trained on, and of how many pixels
-    date, machine, commit       when and where it was scored, and with which code
+    scene, method, seed         method: its name and the settings that differ from its defaults, as in "stablegs vsp_weight=0"
+    steps, views, size          of the training: steps, number of training views, and their sizes in pixels
+    date, machine, commit       of the scores
     psnr, ssim, ...             as in a sweep's results.csv (`analysis.runs.sweep.sweep_results`): scores, Gaussians, seconds,
                                 threads, traces, ends of the spectrum and indices, those of the probe where the run has one
     lambda_second               the second largest eigenvalue
     depth_gradient              the root mean square gradient of the positions along the rays, over that across them; where
                                 `landscape map` has been run, or a probe without --quick
-    needles_quats, needles_log_scales   share of that attribute's trace, each Gaussian's in magnitude, on Gaussians with kappa
-                                above 100; where `landscape map` has been run
+    needles_quats, needles_log_scales   share of the attribute's curvature, sum over Gaussians of |trace|, on Gaussians with
+                                kappa above 100; where `landscape map` has been run
     needles, needle_count       share of the steepest eigenvector's squared mass on Gaussians with kappa above 100, and share of
                                 the visible Gaussians that these are
     one_gaussian                share of the steepest eigenvector's squared mass on a single Gaussian
     INDEX_scene, INDEX_optimiser   the indices in units of the scene's size or of the optimiser's steps, where the families were
                                 measured in these
-    finite_curvature            curvature along the steepest eigenvector seen by steps as long as Adam's first: the root of the
-                                mean of the squared learning rates of its attributes, weighted with its mass
+    finite_curvature            second difference along the steepest eigenvector, at the step nearest to Adam's first: the root
+                                mean square of its attributes' learning rates, weighted with its mass
     opacity_one_view            rank correlation of a Gaussian's curvature in opacity with the share of its weight that one view
                                 sees; where `landscape map` has been run
     hutchinson_ATTRIBUTE, hutchinson_ATTRIBUTE_most   the least and the largest relative standard error that ten Gaussian
@@ -51,18 +50,18 @@ from splat.training.state import LearningRates, TrainConfig
 
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
-TEXTS = ("scene", "method", "size", "date", "machine", "commit", *REASONS)  # of the columns; the others hold numbers
+TEXTS = ("scene", "method", "size", "date", "machine", "commit", *REASONS)  # columns of text; the others are numbers
 SAMPLES = 10  # the paper's B
 
 
 def study(paths: Sequence[Path]) -> pd.DataFrame:
-    """The rows of all paths: folders that hold runs at any depth, and tables that were written as FILE.
+    """The rows of all paths: folders with runs at any depth, and tables FILE.
 
-    InputError where there is no run, or one twice on one machine.
+    Raises InputError where a path has no run, or a run is there twice on one machine.
     """
     tables = [_stored(path) if path.is_file() else pd.DataFrame(map(row_of, _runs(path))) for path in paths]
     rows = pd.concat(tables, ignore_index=True)
-    if (again := rows.duplicated([*KEYS, *(key for key in ("machine",) if key in rows)])).any():
+    if (again := rows.duplicated([*KEYS, *rows.columns.intersection(["machine"])])).any():
         twice = rows[again].iloc[0]
         raise InputError(
             f"expected every run once, got {twice['method']} with seed {twice['seed']} of {twice['scene']} twice"
@@ -71,7 +70,7 @@ def study(paths: Sequence[Path]) -> pd.DataFrame:
 
 
 def _stored(path: Path) -> pd.DataFrame:
-    """The rows of a table that was written as FILE.  InputError where a column is missing, or has other than numbers."""
+    """The rows of a table FILE.  Raises InputError where a column is missing or has other than numbers."""
     try:
         table = pd.read_csv(path, dtype=dict.fromkeys(TEXTS, str), keep_default_na=False, na_values=[""])
     except (ValueError, OverflowError) as error:  # pandas names no file
@@ -87,7 +86,7 @@ def _stored(path: Path) -> pd.DataFrame:
 
 
 def _runs(path: Path) -> list[Path]:
-    """Runs that have ended; InputError where there is none."""
+    """Runs with scores.  Raises InputError where there is none."""
     found = [run for run in _trained(path) if (run / METRICS).is_file()]
     if not found:
         raise InputError(
@@ -97,7 +96,7 @@ def _runs(path: Path) -> list[Path]:
 
 
 def unended(paths: Sequence[Path]) -> list[Path]:
-    """Runs without scores, which are in no row; not the checkpoints that a run has in folders of its own."""
+    """Runs without scores, which have no row.  Not listed: the further checkpoints within a run's folder."""
     found = [run for path in paths if path.is_dir() for run in _trained(path) if not (run / METRICS).is_file()]
     return [run for run in found if not any((parent / CHECKPOINT).is_file() for parent in run.parents)]
 
@@ -107,25 +106,24 @@ def _trained(path: Path) -> list[Path]:
 
 
 def row_of(run: Path) -> dict[str, Any]:
-    """The row of one run; its probe must be of its checkpoint, else it counts as not probed."""
+    """The row of one run.  A probe of another step than the checkpoint's is ignored."""
     checkpoint = load_checkpoint(run / CHECKPOINT)
-    config, row = checkpoint.training.config, {}
-    row |= {
+    config, step = checkpoint.training.config, checkpoint.training.step
+    row = {
         "scene": Path(checkpoint.scene.absolute).name,
         "method": method_name(config, checkpoint.scene.start),
         "seed": config.seed,
+        "steps": step,
+        "views": len(checkpoint.scene.train),
+        "size": ", ".join(sorted({f"{width} x {height}" for width, height in checkpoint.scene.sizes})),
     }
-    sizes = sorted({f"{width} x {height}" for width, height in checkpoint.scene.sizes})
-    row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train), "size": ", ".join(sizes)}
     row |= metrics_of(run) | _made(run) | _of_map(run)
     if not (run / PROBE / ProbeRecord.FILE).is_file():
         return row
     data = read_record(run / PROBE, ProbeRecord).data
-    return (
-        row | probe_of(run) | _more(data, config.rates, checkpoint.training.extent)
-        if data.provenance.iteration == checkpoint.training.step
-        else row
-    )
+    if data.provenance.iteration != step:
+        return row
+    return row | probe_of(run) | _more(data, config.rates, checkpoint.training.extent)
 
 
 def _made(run: Path) -> dict[str, str]:
@@ -143,9 +141,9 @@ def _of_map(run: Path) -> dict[str, float]:
 
 
 def method_name(config: TrainConfig, start: Source = "scene") -> str:
-    """The method, its start and protocol where they are not the usual ones, and what was changed of its settings.
+    """The method, its start and protocol where they are not the default, and its settings that differ from their defaults.
 
-    What a method scales to the length of the training is not changed, nor what is said of the files that it is given.
+    Defaults are those scaled to the length of the training; the setting `depths`, of input files, is not compared.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS
     >>> method_name(TrainConfig(500, method=StableGS(vsp_weight=0.0, warm_up=50))), method_name(TrainConfig(), "dense")
@@ -171,7 +169,7 @@ def _text(value: Any) -> str:
 
 
 def _more(data: ProbeRecord, rates: LearningRates, extent: float) -> dict[str, float]:
-    """Columns that statements and predictors need beside those of a sweep."""
+    """Columns for statements and predictors in addition to those of a sweep."""
     second, lives = data.eigenvalues.second, data.eigenvalues.max.lives_on
     row = {"lambda_second": _number(second and second.value)}
     if data.depth:
@@ -188,7 +186,7 @@ def _more(data: ProbeRecord, rates: LearningRates, extent: float) -> dict[str, f
 
 
 def _finite(data: ProbeRecord, shares: Mapping[str, float], rates: LearningRates, extent: float) -> dict[str, float]:
-    """The curvature at the step nearest to the length of Adam's."""
+    """The second difference at the step nearest in length to Adam's first, along a vector with these shares of attributes."""
     if not data.finite_probe:
         return {}
     lengths = step_lengths(rates, extent)
@@ -199,9 +197,9 @@ def _finite(data: ProbeRecord, shares: Mapping[str, float], rates: LearningRates
 
 
 def _hutchinson(data: ProbeRecord) -> dict[str, float]:
-    """The least and the largest relative standard error of the mean of B samples v . H v.
+    """Lower and upper bound of the relative standard error of the mean of B samples v . H v with Gaussian v, by block.
 
-    Its variance is 2 |H|_F^2 / (B tr^2) = (2 / (B r)) (S / tr)^2 with S = sum |lambda| >= |tr| and r = S^2 / sum lambda^2.
+    Its square is 2 |H|_F^2 / (B tr^2) = (2 / (B r)) (S / tr)^2 with S = sum |lambda| >= |tr| and r = S^2 / sum lambda^2.
     """
     found = {}
     for row in data.families or ():
@@ -215,9 +213,8 @@ def _hutchinson(data: ProbeRecord) -> dict[str, float]:
         )
         least = abs(_number(trace.value)) - 2 * error
         if rank.low and share.low and least > 0:
-            found[f"hutchinson_{row.block}_most"] = (
-                sqrt(2 / (SAMPLES * rank.low)) * (top + residual) / share.low / least
-            )
+            absolute_sum = (top + residual) / share.low
+            found[f"hutchinson_{row.block}_most"] = sqrt(2 / (SAMPLES * rank.low)) * absolute_sum / least
     return found
 
 

@@ -16,14 +16,7 @@ from rich.console import Console
 from scipy.stats import binom
 
 from analysis.commands.cli import main
-from analysis.measures.families import (
-    FamilyFindings,
-    FamilyOptions,
-    _seconds_a_product,
-    expected_families,
-    measure_families,
-    quotient,
-)
+from analysis.measures.families import FamilyFindings, FamilyOptions, _seconds_a_product, measure_families, quotient
 from analysis.measures.split_control import split_in_two
 from analysis.probe.command import scene_objective
 from analysis.records.records import ProbeRecord, Record, read_record
@@ -136,8 +129,8 @@ def of_split(objective: SceneObjective, checkpoint: Checkpoint) -> SceneObjectiv
 
 def test_every_stage_of_the_families_has_an_expected_time(record):
     ran = [name for name in record.data.timing if name.startswith("families")]
-    assert list(expected_families(FamilyOptions(split_control=True))) == ran
-    assert list(expected_families(FamilyOptions())) == [name for name in ran if "split" not in name]
+    assert list(FamilyOptions(split_control=True).expected) == ran
+    assert list(FamilyOptions().expected) == [name for name in ran if "split" not in name]
 
 
 @pytest.mark.parametrize("operator", ["hessian", "gauss-newton"])

@@ -487,6 +487,6 @@ def test_the_first_view_is_that_of_the_steepest_direction(tmp_path, monkeypatch)
     )
     found = SimpleNamespace(steepest=[steepest], panels=[])
     monkeypatch.setattr(report, "map_beside", lambda record: found)
-    monkeypatch.setattr(report, "where", lambda *_: [])
+    monkeypatch.setattr(report, "map_pictures", lambda *_: [])
     text = write_report(path.parent).read_text(encoding="utf-8")
     assert 'id="name">2 of 3: b.png<' in text and 'value="1" aria-label' in text
