@@ -39,7 +39,7 @@ from splat.raster.dispatch import Adjoint, Raster, Tangent
 from splat.raster.formulas import BLOCK_SUMS
 from splat.render.forward import rasterize_view, touches
 
-LOSS_PLANES = 19  # planes that a linearised loss keeps: target, its moments, gradient, a blurred one, a product
+LOSS_PLANES = 34  # a linearized loss keeps: target, its moments, gradient, blur(S_p), second derivatives, a product
 DOUBLE_BLOCK = 8 * 9 * 9  # bytes of a 9 x 9 block in double precision
 VECTORS = 8  # most vectors in a product at a time: more would not fit into the second-level cache
 
