@@ -83,6 +83,10 @@ class CpuRaster:
 
     @cached_property
     def reached(self) -> tuple[tile.Lists, np.ndarray]:
+        """`number_accumulators`, kept from the first pass that sums over pixels on."""
+        return self.number_accumulators()
+
+    def number_accumulators(self) -> tuple[tile.Lists, np.ndarray]:
         """The intersections that some pixel reaches, and (n + 1,) the first accumulator of each splat."""
         stops = self._tiles(self.pixels.stop[None]).max(axis=(0, 2, 4)).reshape(-1)
         reached = np.minimum(np.diff(self.lists.start), stops).astype(np.int64)
