@@ -19,6 +19,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
 from analysis.records.records import ProbeRecord, read_record
+from landscape.errors import InputError
 from splat.model.untrusted import replacing
 
 COLUMN = 3.3
@@ -84,6 +85,8 @@ def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:
     compression: of a PNG, 0 to 9; of photographs a low one takes a fifth of the time for a few percent more bytes.
     """
     path = Path(path)
+    if path.suffix not in (".png", ".pdf", ".svg"):
+        raise InputError(f"expected a file that ends with .png, .pdf or .svg, got {path}")
     path.parent.mkdir(parents=True, exist_ok=True)
     with style(), replacing(path) as partial:
         if (

@@ -49,10 +49,8 @@ OPERATORS: dict[schema.Operator, bool] = {"hessian": False, "gauss-newton": True
 PARTS = 6  # the whole and five attributes
 FEWEST_STEPS = 2  # that make a density
 TRACE_SAMPLES = 8  # of SSIM's coupling: to a few percent, less than the error from the density's start vectors
-PRODUCTS, SPLIT = (
-    26.0,
-    1.5,
-)  # expected products of a family, with a batch of vectors; factor of their cost in the split scene
+PRODUCTS = 26.0  # expected of a family, with a batch of vectors
+SPLIT = 1.5  # factor of their cost in the split scene
 DENSITY_SHARE = 0.45  # of a family's time, as by default 48 of its 108 products
 
 

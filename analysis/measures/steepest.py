@@ -34,10 +34,7 @@ from splat.render.sight import Sight, sight
 from splat.scenes.view import View
 
 LEAST, MOST = 0.05, 5  # share of the mass that makes a carrier; most carriers
-RISE, STEPS = (
-    0.01,
-    7,
-)  # change of the loss by the longest step, as a share; steps (at the shortest 2e-6, well above round-off)
+RISE, STEPS = 0.01, 7  # relative change of the loss by the longest step (the shortest: 2e-6, above round-off); steps
 AGREES = 0.2  # largest |factor - 1| that counts as agreement
 SIGMAS = 2.0  # standard deviations at which an outline is drawn
 ROOM, SMALLEST = 1.3, 8  # size of a crop: in outlines; at least 1 / SMALLEST of its view

@@ -172,14 +172,8 @@ def _write(
 def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
     """A checkpoint, of this toolkit or of another, and its scene.  out: a refusal may leave a picture, OUT-mismatch.png."""
     listed = None if ask.train_list is None else read_names(ask.train_list)
-    files = {
-        "scene": folder,
-        "views": ask.views,
-        "train_list": listed,
-        "images": ask.images,
-        "downscale": ask.downscale,
-    }
-    foreign = replace(of_trainer(ask), **files)
+    files = replace(of_trainer(ask), scene=folder, images=ask.images, downscale=ask.downscale)
+    foreign = replace(files, views=ask.views, train_list=listed)
     checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
     scene = checkpoint.load_scene(path, folder)
     return checkpoint.thinned(scene, ask.max_views), scene

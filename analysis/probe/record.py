@@ -279,8 +279,14 @@ def counts_of(active: ActiveCounts, views_of: int | None, **work: int) -> Counts
 
 def _counts(found: Measured, objective: SceneObjective) -> Counts:
     renders = 0 if found.plane is None else found.plane.slice.evaluations * objective.counts.views
-    work = {"rank": found.rank, "views_kept_linearised": objective.linearized.kept, "products": found.matvecs}
-    return counts_of(objective.counts, found.left_out and found.left_out.population, **work, renders=renders)
+    return counts_of(
+        objective.counts,
+        found.left_out and found.left_out.population,
+        rank=found.rank,
+        views_kept_linearised=objective.linearized.kept,
+        products=found.matvecs,
+        renders=renders,
+    )
 
 
 def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, float]) -> dict[str, Skip]:

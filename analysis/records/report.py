@@ -41,11 +41,8 @@ from landscape.slices.eye import eye_over
 from splat.model.untrusted import replacing
 
 FILE, SPLATS = "report.html", "view.html"  # in the record's folder, and beside it: the page of `landscape view --html`
-FINE, COARSE, EFFORT = (
-    82,
-    60,
-    2,
-)  # quality of WebP: of drawings, and of maps, which are noisy; effort of its encoder, 0 to 6
+FINE, COARSE = 82, 60  # quality of WebP: of drawings, and of maps, which are noisy
+EFFORT = 2  # of its encoder, 0 to 6
 PICTURES = {
     "slice2d": "The loss on the plane of the two steepest directions. Dots: renders, blue where the order of the splats or the "
     "set of visible ones is not the checkpoint's; dashed: the quadratic model.",

@@ -51,9 +51,8 @@ UNEVEN = 0.1  # spread of the squares of a start vector's entries about 1
 SETTLED = 1e-4  # largest error of an eigenvector found by the runs
 FOUND, CLOSE = 1e-2, 0.1  # largest error of an eigenvector found before, and its residual over the eigenvalue
 SAME = 1e-6  # largest 1 - cos^2 between equal eigenvectors
-FEWEST_STARTS = (
-    4  # by default: Student's interval of three is half as long again (`quantiles`); kernels favour blocks of four
-)
+# by default: Student's interval of three is half as long again (`quantiles`), and kernels favour blocks of four
+FEWEST_STARTS = 4
 FIRST_LOOK, GROWTH = 12, 4 / 3  # steps
 CONFIDENCE = 0.95  # of the interval that is to be short
 

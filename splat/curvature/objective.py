@@ -146,7 +146,10 @@ class SceneObjective:
         if keep_unseen:
             self.mask = torch.ones_like(self.mask)
         self.active = used.select(self.mask)
-        self._unseen = Regularizers(used.select(~self.mask), loss_settings, len(gaussians)).value
+        regularized = loss_settings.opacity_reg or loss_settings.scale_reg  # else the unseen need not be copied
+        self._unseen = (
+            Regularizers(used.select(~self.mask), loss_settings, len(gaussians)).value if regularized else 0.0
+        )
         quats = self.active.quats
         quats /= quats.norm(dim=1, keepdim=True)
         self.counts = ActiveCounts(

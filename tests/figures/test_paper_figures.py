@@ -10,6 +10,7 @@ import pytest
 from matplotlib.colors import to_hex
 from PIL import Image
 
+from analysis.console.failures import report
 from analysis.records.records import SliceRecord, read_record, record_folder, write_record
 from figures import fig1, fig7
 from figures.manifold import Scale, landscape_of, start_of
@@ -175,12 +176,15 @@ def test_landscapes_of_different_functions_are_not_drawn_beside_each_other(
         module.draw(runs)
 
 
-def test_a_missing_record_is_named_with_the_command_that_makes_it(runs, tmp_path, monkeypatch):
+def test_a_missing_record_is_named_with_the_command_that_makes_it(runs, tmp_path, capsys, monkeypatch):
     def refused(module, words: str) -> None:
         monkeypatch.setattr(sys, "argv", ["figure", *map(str, runs), "--out", str(tmp_path / "out.png")])
         with pytest.raises((InputError, FileNotFoundError)) as missing:
             module.main()
-        assert words in str(missing.value) and not (tmp_path / "out.png").exists()
+        code = report(missing.value, [])  # as `program` does
+        said = capsys.readouterr().err
+        assert code == 2 and words in said and said.count("\n") == 1, said
+        assert not (tmp_path / "out.png").exists()
 
     (runs[0] / "start" / "slice-eigenvectors-2d" / "slice.json").unlink()
     refused(fig7, f"run: landscape slice {runs[0] / 'start' / 'checkpoint.pt'}")
@@ -198,6 +202,13 @@ def test_a_missing_record_is_named_with_the_command_that_makes_it(runs, tmp_path
     refused(fig1, f"run: landscape slice {runs[1] / 'checkpoint.pt'}")
     slice_at(runs[1], 1.0)
     refused(fig1, "run landscape train to its end")
+
+
+def test_a_suffix_that_is_none_of_a_picture_is_refused(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["figure", *map(str, runs), "--out", str(tmp_path / "out.abc")])
+    with pytest.raises(InputError, match=r"expected a file that ends with \.png, \.pdf or \.svg, got .*out\.abc"):
+        fig7.main()
+    assert not list(tmp_path.glob("out*"))
 
 
 @pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])

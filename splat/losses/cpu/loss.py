@@ -117,12 +117,13 @@ class CpuViewLoss(CpuImageLoss):
     def linearize(self, image: Float[Tensor, "k H W"], second_order: bool = True) -> "CpuLinearLoss":
         gradient = aligned((4, self.frame.plane_rows, self.frame.stride), self.dtype)
         wanted = second_order and self.structural
-        blurred, seconds = (self.planes(sets if wanted else 0) for sets in (1, SECONDS))
+        seconds = self.planes(SECONDS if wanted else 0)
+        flat = self.planes(1 if wanted else 0).reshape(-1), seconds.reshape(-1)
         gradient[:, self.frame.height :] = 0
         gradient[3] = 0
-        value = self._sweep(*self._against(image), gradient.reshape(-1), blurred.reshape(-1), seconds.reshape(-1))
+        value = self._sweep(*self._against(image), gradient.reshape(-1), *flat)
         self._leave_margin(seconds)
-        return CpuLinearLoss(self, value, torch.from_numpy(gradient), image, blurred.reshape(-1), seconds.reshape(-1))
+        return CpuLinearLoss(self, value, torch.from_numpy(gradient), image, *flat)
 
     def _leave_margin(self, planes: np.ndarray) -> None:
         """Set planes to 0 where no window counts, and in their padding."""
@@ -213,7 +214,8 @@ class CpuLinearLoss:
         loss, uncoupled = self.loss, self.loss.planes(1)
         image, target, _ = loss._against(self._image)
         uncoupled[:, :, loss.frame.height :] = 0
-        self._sweep(uncoupled_rows, uncoupled.reshape(-1))
+        images = image, target, self._blurred
+        over_range(3 * loss.frame.height, uncoupled_rows, loss.frame, loss.loss, *images, uncoupled.reshape(-1))
         return Coupling(image, target, self._seconds, -loss.structural, uncoupled.reshape(-1))
 
     @cached_property

@@ -101,13 +101,14 @@ def window_at(own, row, i, at, frame, target):
 def differentiate(own, row, top, frame, margin, target, rows, values, slopes, gradient, seconds, keep):
     """Stage two of the gradient, if any: S_m, S_p, S_q of a row, blurred along it, to `slopes`; the sum of 1 - S.
 
-    keep: whether to write `seconds`, also where no window counts beside those that do.
+    keep: whether to write the row of `seconds`, over all its columns: those where no window counts are cleared afterwards.
     """
+    at, size = top + row * frame.stride, 3 * frame.plane_rows * frame.stride
     if not counts(row, margin, frame):
         clear(slopes, 0, 3, row, frame)
         return 0.0
     for i in range(0, frame.stride, lanes(own)):
-        m, p, q, mu, var = window_at(own, row, i, top + row * frame.stride, frame, target)
+        m, p, q, mu, var = window_at(own, row, i, at, frame, target)
         distance, sm, sp, sq = ssim_slopes(m, p, q, mu, var)
         store(values, BORDER + i, distance)
         if gradient is not None:
@@ -115,7 +116,7 @@ def differentiate(own, row, top, frame, margin, target, rows, values, slopes, gr
             if keep:
                 found = ssim_seconds(m, p, q, mu, var)
                 for j in range(SECONDS):
-                    store(seconds, (3 * j * frame.plane_rows + row) * frame.stride + top + i, found[j])
+                    store(seconds, j * size + at + i, found[j])
     leave_margin(values, 1, margin, frame)
     if gradient is not None:
         leave_margin(rows, 3, margin, frame)
@@ -395,7 +396,7 @@ def diagonal_rows(start, stop, frame, loss, x, y, blurred_sp, seconds, squared, 
 
 
 @kernel
-def uncoupled_rows(start, stop, frame, loss, x, y, blurred_sp, seconds, uncoupled):
+def uncoupled_rows(start, stop, frame, loss, x, y, blurred_sp, uncoupled):
     """What a loss with SSIM adds to v . l'' v for a pixel's v^2: its pixel loss's curvature, and SSIM's by blur(S_p)."""
     for channel in range(3):
         top, first, last, _ahead = part_of(start, stop, channel, 0, frame)

@@ -185,8 +185,9 @@ class StableGSMethod(Method[StableGS]):
             row["standard_error"] = estimates[name].standard_error
             self.history.append(row | {"capped": magnitude.capped, "negative": magnitude.negative})
         if settings.vsp_weight and settings.viewpoint.edge_rotation:
-            depths = (render_depth(step.gaussians, view.camera, step.config.render) for view in step.views)
-            self.normals = [dominant_edge(depth, alpha)[0] for depth, alpha in depths]
+            with torch.no_grad():
+                depths = (render_depth(step.gaussians, view.camera, step.config.render) for view in step.views)
+                self.normals = [dominant_edge(depth, alpha)[0] for depth, alpha in depths]
 
     def traces(self, objective: SceneObjective) -> dict[str, TraceEstimate]:
         """Traces of the Hessian's blocks of the probed attributes."""
