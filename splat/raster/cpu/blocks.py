@@ -76,13 +76,13 @@ def block_moments(counter, params, lists, frame, pixels, v_planes, curvature, su
 def block_of(params, lists, e, k, x0, y0, frame, state, shared, sums):
     """Undo intersection e, and write its sums."""
     L = lanes(params)
-    _splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    _splat, u, terms, colour, index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
     zero = broadcast(params, 0.0)
     m0, m1, m2, m3, m4 = zero, zero, zero, zero, zero
     for y in range(top, bottom):
         b = BLOCK * L * y
         v = row_v(frame, L, y, terms)
-        w, free, beta = undo_row(state, b, L, frame, v, terms, index, capped)
+        w, free, beta = undo_row(state, b, L, frame, v, terms, index)
         R, g, h = load3(state, b + BEHIND * L, L), load3(state, b + GRAD * L, L), load3(state, b + CURVATURE * L, L)
         D, after, weight = step_block(w, free, beta, R, g, h, colour)
         store3(state, b + BEHIND * L, L, after)

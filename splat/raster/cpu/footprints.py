@@ -91,10 +91,10 @@ def find_footprints(counter, params, lists, frame, pixels, footprints, begin, en
 def footprint_of(params, lists, e, k, x0, y0, frame, state, found, at):
     """Undo intersection e, and write its rows to found at `at`, unless it is negative."""
     L = lanes(params)
-    _splat, _u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    _splat, _u, terms, colour, index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
     for y in range(top, bottom):
         b = UNDO * L * y
-        w, free, beta = undo_row(state, b, L, frame, row_v(frame, L, y, terms), terms, index, capped)
+        w, free, beta = undo_row(state, b, L, frame, row_v(frame, L, y, terms), terms, index)
         R = load3(state, b + BEHIND * L, L)
         store3(state, b + BEHIND * L, L, plus(R, w, colour))
         if at >= 0:

@@ -148,17 +148,14 @@ def begin_undo_row(state, b, L, frame, pixels, p):
 
 
 @formula
-def undo_row(state, b, L, frame, v, terms, index, capped):
+def undo_row(state, b, L, frame, v, terms, index):
     """Undo a splat in T of a row; w, and w and beta where the cap does not hold."""
     alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
     r = reciprocal(1.0 - alpha)
     before = load(state, b + T * L) * r
     store(state, b + T * L, before)
-    w, beta = alpha * before, alpha * r
-    free = w
-    if capped:
-        free, beta = select(uncapped <= frame.cap, w, 0.0), select(uncapped <= frame.cap, beta, 0.0)
-    return w, free, beta
+    w, free = alpha * before, uncapped <= frame.cap
+    return w, select(free, w, 0.0), select(free, alpha * r, 0.0)
 
 
 @formula
