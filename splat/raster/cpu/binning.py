@@ -11,7 +11,7 @@ from splat.backend.cpu.jit import kernel
 from splat.backend.cpu.planes import TILE_ROWS
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
-from splat.raster.cpu.tile import CAPPED, Lists
+from splat.raster.cpu.tile import Lists
 from splat.raster.formulas import Thresholds, box_of, ellipse_of, rows_of_strip
 
 RADIX_BITS = 11
@@ -59,24 +59,20 @@ def count_tiles(start, stop, splats, order, tile, width, height, alpha_min, cont
 
 
 @kernel
-def list_tiles(
-    start, stop, splats, order, tile, columns, width, height, alpha_min, contour, cap, place, count, tiles, rows
-):
+def list_tiles(start, stop, splats, order, tile, columns, width, height, alpha_min, contour, place, count, tiles, rows):
     """The tiles that each splat touches and its rows in them, at place[i], place[i] + 1, ...; count[i] of them."""
     for i in range(start, stop):
         count[i] = 0
         if place[i + 1] > place[i]:
             own_tiles, own_rows = tiles[place[i] :], rows[place[i] :]
-            count[i] = list_splat(
-                splats[order[i]], tile, columns, width, height, alpha_min, contour, cap, own_tiles, own_rows
-            )
+            splat = splats[order[i]]
+            count[i] = list_splat(splat, tile, columns, width, height, alpha_min, contour, own_tiles, own_rows)
 
 
 @kernel
-def list_splat(splat, tile, columns, width, height, alpha_min, contour, cap, tiles, rows):
+def list_splat(splat, tile, columns, width, height, alpha_min, contour, tiles, rows):
     ellipse = ellipse_of(splat, alpha_min, contour)
     x0, x1, _y0, _y1 = box_of(splat, ellipse, width, height)
-    flags = CAPPED if splat[5] > cap else 0
     k = 0
     for column in range(x0 // tile, x1 // tile + 1):
         y0, y1 = rows_of_strip(splat, ellipse, column, tile, width, height)
@@ -84,7 +80,7 @@ def list_splat(splat, tile, columns, width, height, alpha_min, contour, cap, til
             for row in range(y0 // TILE_ROWS, y1 // TILE_ROWS + 1):
                 top, bottom = max(y0 - row * TILE_ROWS, 0), min(y1 - row * TILE_ROWS, TILE_ROWS - 1)
                 tiles[k] = row * columns + column
-                rows[k] = top | bottom << 8 | flags
+                rows[k] = top | bottom << 8
                 k += 1
     return k
 
@@ -122,8 +118,7 @@ def bin_splats(
     np.cumsum(bound, out=place[1:])
     count = np.empty(order.size, np.int32)
     tiles, rows = np.empty(place[-1], np.int32), np.empty(place[-1], np.int32)
-    found = (place, count, tiles, rows)
-    over_range(order.size, list_tiles, splats, order, tile, columns, *where[1:], thresholds.free, *found)
+    over_range(order.size, list_tiles, splats, order, tile, columns, *where[1:], place, count, tiles, rows)
     intersections, start = int(count.sum()), np.empty(tile_count + 1, np.int64)
     splat_of, rows_of = np.empty(intersections, np.int32), np.empty(intersections, np.int32)
     fill_lists(order, place, count, tiles, rows, start, splat_of, rows_of)

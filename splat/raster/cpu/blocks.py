@@ -76,7 +76,7 @@ def block_moments(counter, params, lists, frame, pixels, v_planes, curvature, su
 def block_of(params, lists, e, k, x0, y0, frame, state, shared, sums):
     """Undo intersection e, and write its sums."""
     L = lanes(params)
-    _splat, u, terms, colour, index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    _splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
     zero = broadcast(params, 0.0)
     m0, m1, m2, m3, m4 = zero, zero, zero, zero, zero
     for y in range(top, bottom):

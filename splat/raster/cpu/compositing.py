@@ -67,7 +67,7 @@ def forward(counter, params, lists, frame, pixels):
 def composite(params, lists, e, k, x0, y0, frame, state):
     """Composite intersection e; True if it stopped a pixel."""
     L = lanes(params)
-    _splat, _u, terms, colour, _index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    _splat, _u, terms, colour, _index, top, bottom = intersection(params, lists, e, k, x0, y0)
     stopped = False
     for y in range(top, bottom):
         b = FORWARD * L * y
@@ -143,7 +143,7 @@ def begin_backward_row(state, b, L, frame, pixels, v_planes, p):
 def differentiate(params, lists, e, k, x0, y0, frame, state, sums):
     """Undo intersection e, and write its sums."""
     L = lanes(params)
-    _splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    _splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
     moments = no_moments(params)
     for y in range(top, bottom):
         b = BACKWARD * L * y
@@ -151,9 +151,7 @@ def differentiate(params, lists, e, k, x0, y0, frame, state, sums):
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
         R, v_image = load(state, b + REST * L), load3(state, b + GRAD * L, L)
         before, rest, w, beta, _r, we = step_back(alpha, load(state, b + T * L), R, v_image, colour)
-        s = we - beta * R
-        if capped:
-            s = select(uncapped <= frame.cap, s, 0.0)
+        s = select(uncapped <= frame.free, we - beta * R, 0.0)
         store(state, b + T * L, before)
         store(state, b + REST * L, rest)
         moments = add_row(moments, v, s, w, v_image)

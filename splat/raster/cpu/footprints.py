@@ -91,7 +91,7 @@ def find_footprints(counter, params, lists, frame, pixels, footprints, begin, en
 def footprint_of(params, lists, e, k, x0, y0, frame, state, found, at):
     """Undo intersection e, and write its rows to found at `at`, unless it is negative."""
     L = lanes(params)
-    _splat, _u, terms, colour, index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    _splat, _u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
     for y in range(top, bottom):
         b = UNDO * L * y
         w, free, beta = undo_row(state, b, L, frame, row_v(frame, L, y, terms), terms, index)
@@ -129,7 +129,7 @@ def find_neighbours(counter, params, lists, frame, pixels, width, height, covere
 def neighbours_of(params, lists, e, k, x0, y0, frame, state, row):
     """Number of pixels in which intersection e has weight, and the nearest intersection in front in one of them, or -1."""
     L = lanes(params)
-    _splat, _u, terms, _colour, index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    _splat, _u, terms, _colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
     none, one = broadcast(params, 0.0), broadcast(params, 1.0)
     ones, nearest = none, -one
     for y in range(top, bottom):

@@ -10,7 +10,7 @@ import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.planes import TILE_ROWS, scratch
-from splat.backend.cpu.simd import broadcast, fma, lanes, load, prefetch, select, store
+from splat.backend.cpu.simd import fma, lanes, load, prefetch, select, store
 from splat.raster.cpu.compositing import begin_backward_row
 from splat.raster.cpu.tile import (
     AHEAD,
@@ -109,7 +109,7 @@ def tangent_row(state, b, L, alpha, w, w_dq, colour, dcolour):
 def tangent_single(params, tangents, lists, e, k, x0, y0, frame, state):
     """Advance the rows of a tile by intersection e, number k of the tile, for one tangent."""
     L = lanes(params)
-    splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
     dterms, dcolour = tangent_terms(tangents, splat * SPLAT, u)
     for y in range(top, bottom):
         b = (2 + TANGENT) * L * y
@@ -117,9 +117,7 @@ def tangent_single(params, tangents, lists, e, k, x0, y0, frame, state):
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
         before = load(state, b + T * L)
         store(state, b + T * L, fma(-alpha, before, before))
-        dq = quadratic(v, dterms)
-        if capped:
-            dq = select(uncapped <= frame.cap, dq, 0.0)
+        dq = select(uncapped <= frame.free, quadratic(v, dterms), 0.0)
         w = alpha * before
         tangent_row(state, b + 2 * L, L, alpha, w, w * dq, colour, dcolour)
 
@@ -129,14 +127,14 @@ def tangent_block(params, tangents, K, lists, e, k, x0, y0, frame, state, shared
     """Advance the rows of a tile by intersection e, number k of the tile, for K tangents."""
     L = lanes(params)
     width = (2 + TANGENT * K) * L
-    splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
     for y in range(top, bottom):
         b = width * y
         alpha, uncapped = alpha_row(row_v(frame, L, y, terms), terms, index < load(state, b + STOP * L), frame.cap)
         before = load(state, b + T * L)
         store(state, b + T * L, fma(-alpha, before, before))
         w = alpha * before
-        free = select(uncapped <= frame.cap, w, 0.0) if capped else w
+        free = select(uncapped <= frame.free, w, 0.0)
         store3(shared, 3 * L * y, L, (alpha, w, free))
     for i in range(K):
         dterms, dcolour = tangent_terms(tangents, (splat * K + i) * SPLAT, u)
@@ -156,7 +154,7 @@ def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, 
     K = transmittances.size // frame.size
     width = (BACKWARD + BACKWARD_TANGENT * K) * L
     state = scratch(params, width * TILE_ROWS)
-    shared = scratch(params, 4 * L * TILE_ROWS)  # a row: w, beta, r R, 1 where the cap does not hold
+    shared = scratch(params, 4 * L * TILE_ROWS)  # a row: w, beta, r R, and alpha without the cap
     tile = next_tile(counter, lists)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
@@ -221,7 +219,7 @@ def backward_tangent_row(state, b, L, w, beta, rR, dq, v_image, colour, dcolour)
 def backward_tangent_single(params, tangents, lists, e, k, x0, y0, frame, state, sums):
     """Undo intersection e, number k of its tile, and write its sums, for one tangent."""
     L = lanes(params)
-    splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
     dterms, dcolour = tangent_terms(tangents, splat * SPLAT, u)
     moments = no_moments(params)
     for y in range(top, bottom):
@@ -230,13 +228,9 @@ def backward_tangent_single(params, tangents, lists, e, k, x0, y0, frame, state,
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
         v_image = load3(state, b + GRAD * L, L)
         w, beta, rR = backward_row(state, b, L, alpha, v_image, colour)
-        dq = quadratic(v, dterms)
-        if capped:
-            dq = select(uncapped <= frame.cap, dq, 0.0)
+        dq = select(uncapped <= frame.free, quadratic(v, dterms), 0.0)
         ds, h = backward_tangent_row(state, b + BACKWARD * L, L, w, beta, rR, dq, v_image, colour, dcolour)
-        if capped:
-            ds = select(uncapped <= frame.cap, ds, 0.0)
-        moments = add_row(moments, v, ds, w, h)
+        moments = add_row(moments, v, select(uncapped <= frame.free, ds, 0.0), w, h)
     store_moments(sums, np.int64(lists.accumulator[e]), moments, u)
 
 
@@ -245,13 +239,12 @@ def backward_tangent_block(params, tangents, K, lists, e, k, x0, y0, frame, stat
     """Undo intersection e, number k of its tile, and write its sums, for K tangents."""
     L = lanes(params)
     width = (BACKWARD + BACKWARD_TANGENT * K) * L
-    splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
     for y in range(top, bottom):
         b, x = width * y, 4 * L * y
         alpha, uncapped = alpha_row(row_v(frame, L, y, terms), terms, index < load(state, b + STOP * L), frame.cap)
         store3(shared, x, L, backward_row(state, b, L, alpha, load3(state, b + GRAD * L, L), colour))
-        if capped:
-            store(shared, x + 3 * L, select(uncapped <= frame.cap, broadcast(params, 1.0), 0.0))
+        store(shared, x + 3 * L, uncapped)
     for i in range(K):
         dterms, dcolour = tangent_terms(tangents, (splat * K + i) * SPLAT, u)
         moments = no_moments(params)
@@ -259,12 +252,9 @@ def backward_tangent_block(params, tangents, K, lists, e, k, x0, y0, frame, stat
             b, x = width * y, 4 * L * y
             v = row_v(frame, L, y, terms)
             w, beta, rR = load3(shared, x, L)
-            v_image, dq = load3(state, b + GRAD * L, L), quadratic(v, dterms)
-            if capped:
-                dq *= load(shared, x + 3 * L)
+            free, v_image = load(shared, x + 3 * L) <= frame.free, load3(state, b + GRAD * L, L)
+            dq = select(free, quadratic(v, dterms), 0.0)
             b += (BACKWARD + BACKWARD_TANGENT * i) * L
             ds, h = backward_tangent_row(state, b, L, w, beta, rR, dq, v_image, colour, dcolour)
-            if capped:
-                ds *= load(shared, x + 3 * L)
-            moments = add_row(moments, v, ds, w, h)
+            moments = add_row(moments, v, select(free, ds, 0.0), w, h)
         store_moments(sums, np.int64(lists.accumulator[e]) * K + i, moments, u)

@@ -33,7 +33,6 @@ AHEAD = 6  # intersections between a prefetch and its use
 
 PARAMS = 16  # one cache line in float32: mean x, y (pixel index units), the whitening, LO = log2 o; _REST: of a rounded number
 MX, MX_REST, MY, MY_REST, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT = range(13)
-CAPPED = 1 << 16  # in an intersection's rows: its splat's alpha can reach the cap
 
 # The vectors that a kernel keeps of a row of pixels, in this order; a number is the first of its channels.
 T, STOP = 0, 1  # transmittance, and the index of the intersection at which a pixel stops
@@ -48,7 +47,7 @@ class Lists(NamedTuple):
     """Splats that touch each tile, in order of depth.
 
     start: (tiles + 1,) first intersection of each tile; splat: (intersections,); rows: (intersections,) first row |
-    last row << 8 within the tile, and CAPPED; accumulator: (intersections,) where their sums go, splat by splat;
+    last row << 8 within the tile; accumulator: (intersections,) where their sums go, splat by splat;
     order: the tiles as they are handed out.
     """
 
@@ -60,15 +59,17 @@ class Lists(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Constants of all pixels: tiles in a row, floats in a row of a plane, floats in a plane, cap, floor, background (3,).
+    """Constants of all pixels: tiles in a row, floats in a row of a plane, floats in a plane, cap, background (3,).
 
-    row_offsets: 0, ..., TILE_ROWS - 1, each `lanes` times: read as vectors, they cost the kernels less than a conversion.
+    free, floor: as in `formulas.Thresholds`.  row_offsets: 0, ..., TILE_ROWS - 1, each `lanes` times: as vectors, they cost
+    the kernels less than a conversion.
     """
 
     columns: int
     stride: int
     size: int
     cap: float
+    free: float
     floor: float
     background: np.ndarray
     row_offsets: np.ndarray
@@ -122,13 +123,13 @@ def alpha_terms(params, o, x0, y0):
 def intersection(params, lists, e, k, x0, y0):
     """Intersection e, which is number k of its tile, as all kernels read it.
 
-    Its splat, u of the columns, `alpha_terms`, colour, k, whether the cap may hold, its first row and one past the last.
+    Its splat, u of the columns, `alpha_terms`, colour, k, its first row and one past the last.
     """
     splat = np.int64(lists.splat[e])
     u, terms = alpha_terms(params, splat * PARAMS, x0, y0)
     top, bottom = row_range(lists.rows[e])
     colour = broadcast3(params, splat * PARAMS + RED)
-    return splat, u, terms, colour, broadcast(params, k), lists.rows[e] & CAPPED, top, bottom
+    return splat, u, terms, colour, broadcast(params, k), top, bottom
 
 
 @formula
@@ -154,7 +155,7 @@ def undo_row(state, b, L, frame, v, terms, index):
     r = reciprocal(1.0 - alpha)
     before = load(state, b + T * L) * r
     store(state, b + T * L, before)
-    w, free = alpha * before, uncapped <= frame.cap
+    w, free = alpha * before, uncapped <= frame.free
     return w, select(free, w, 0.0), select(free, alpha * r, 0.0)
 
 
