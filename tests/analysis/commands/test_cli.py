@@ -358,6 +358,20 @@ def test_a_process_prints_everything_and_ends_with_its_exit_code():
     assert (result.returncode, result.stdout) == (3, "the last words\n"), result.stderr
 
 
+@pytest.mark.parametrize(("policy", "expected"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_the_threads_of_torch_sleep_unless_the_user_says_otherwise(policy, expected):
+    program = (
+        "import os, sys\nfrom analysis.commands import cli\n"
+        "cli.main = lambda: print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules) or 0\ncli.command()"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment |= {"OMP_WAIT_POLICY": policy} if policy else {}
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert result.stdout == f"{expected} False\n", result.stderr
+
+
 def test_help_needs_no_torch():
     program = (
         "import sys, analysis.commands.cli\n"
