@@ -51,9 +51,12 @@ class ViewSum:
         return torch.cat(totals, dim=1) if len(totals) > 1 else totals[0]
 
     def forms(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:
-        """v . H_m v for each of this process's views m and each column v."""
-        products = (view.ggn(V) if self.gauss_newton else view.hvp(V) for view in self.objective.linearized)
-        return torch.stack([(V.double() * HV).sum(dim=0).cpu() for HV in products])
+        """v . H_m v for each of this process's views m and each column v; 0 for views after the first `count`."""
+        found = torch.zeros(len(self.objective.views), V.shape[1], dtype=torch.float64)
+        for row, view in zip(found, islice(self.objective.linearized, self.count), strict=False):
+            product = view.ggn if self.gauss_newton else view.hvp
+            row += (V.double() * product(V, coupled=self.coupled)).sum(dim=0).cpu()
+        return found
 
 
 class SceneHessian:
