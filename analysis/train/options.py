@@ -45,7 +45,8 @@ class TrainOptions:
     random: random points in the volume that the training views have in common.
     box: random points in the box of the scene's points."""
     from_: Annotated[Unset[Path], arg(name="from")] = None
-    """A checkpoint, our own or another tool's, whose Gaussians to start from, with its renderer and in its world."""
+    """A checkpoint, our own or another tool's, whose Gaussians to start from, with its renderer and in its world.
+    They are first cloned and split after 500 steps, however short the training is."""
     foreign: Annotated[TrainerOptions, arg(name="")] = field(default_factory=TrainerOptions)
     masks: Unset[Path] = None
     """Folder of object masks, named after the images; the scores are taken inside them.

@@ -33,6 +33,8 @@ def of_trainer(ask: TrainerOptions) -> Foreign:
 def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Planned, Gaussians | None]:
     """The plan in the checkpoint's world and with its renderer, and its Gaussians; the plan as it is without --from.
 
+    Density control begins and recurs after as many steps as in a long training, unless --set says otherwise: each of the rounds
+    that a short training from points has would double the Gaussians of a trained scene before the last ones have moved.
     InputError where the checkpoint is refused, and where --set changes its renderer or --trained-by has no file to speak of.
     """
     scene, split, config, reference = plan
@@ -60,4 +62,6 @@ def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Pl
     theirs = found.training.config
     weights = {name: getattr(theirs.loss, name) for name in regularized}
     loss = replace(config.loss, border=theirs.loss.border, **weights)
-    return (scene, split, replace(config, render=theirs.render, loss=loss), reference), found.training.gaussians
+    whole = {name: 1.0 for name in ("start_share", "every_share") if f"densify.{name}" not in changes}
+    config = replace(config, render=theirs.render, loss=loss, densify=replace(config.densify, **whole))
+    return (scene, split, config, reference), found.training.gaussians
