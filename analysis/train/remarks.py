@@ -30,7 +30,8 @@ HOW_TO_START: dict[Source, str] = {
 
 
 def remarks(scene: Scene, asked: TrainConfig, config: TrainConfig, begun: tuple[Source, int] | None) -> list[str]:
-    """asked, config: the settings, not scaled and scaled; begun: the start and its Gaussians, None where resumed."""
+    """asked, config: the settings, not scaled and scaled, without what a checkpoint brings; begun: the start and its Gaussians,
+    None where there is a checkpoint."""
     found = [_skipped(scene), begun and poor_start(scene, *begun), _scaled(asked, config), _not_reached(config)]
     found += _of_second_order(config)
     return [words for words in found if words]
