@@ -215,6 +215,32 @@ def push_forward(start, stop, jac, d_means, d_log_scales, d_quats, d_logits, d_s
                 out[i, k, 6 + c] = jac.visible[e, c] * total
 
 
+@formula
+def pull_back_geometry(jac, e, y, bar, h):
+    """Fill h (10,) with P'^T y in a Gaussian's geometry.  y (9,): cotangent of its splat; bar (3,): of its colour unclamped."""
+    h[:] = 0
+    for r in range(5):
+        for j in range(GEOMETRY):
+            h[j] += jac.jacobian[e, r, j] * y[1 + r]
+    for c in range(3):
+        for j in range(3):
+            h[j] += jac.colour_slope[e, c, j] * bar[c]
+    for j in range(jac.opacity_slope.shape[1]):
+        h[j] += jac.opacity_slope[e, j] * y[0]
+
+
+@formula
+def add_curvature(jac, e, curvature, u, d_logit, h, logit):
+    """Add (a . P'') of geometry and logit, times their tangents u (10,) and d_logit, to h; return logit with its share."""
+    for j in range(jac.opacity_curvature.shape[1]):
+        h[j] += jac.opacity_curvature[e, j] * d_logit
+        logit += jac.opacity_curvature[e, j] * u[j]
+    for j in range(GEOMETRY):
+        for l in range(GEOMETRY):
+            h[l] += curvature[j, l] * u[j]
+    return logit + jac.logit_curvature[e] * d_logit
+
+
 @kernel
 def pull_back(
     start, stop, jac, second_order, cotangents, d_means, d_log_scales, d_quats, d_logits, d_sh,
@@ -236,24 +262,10 @@ def pull_back(
             gather_tangent(u, i, k, d_means, d_log_scales, d_quats)
             for c in range(3):
                 bar[c] = jac.visible[e, c] * y[6 + c]
-            h[:] = 0
-            for r in range(5):
-                for j in range(GEOMETRY):
-                    h[j] += jac.jacobian[e, r, j] * y[1 + r]
-            for c in range(3):
-                for j in range(3):
-                    h[j] += jac.colour_slope[e, c, j] * bar[c]
             logit = jac.logit_slope[e] * y[0]
-            for j in range(jac.opacity_slope.shape[1]):
-                h[j] += jac.opacity_slope[e, j] * y[0]
-                if second_order:
-                    h[j] += jac.opacity_curvature[e, j] * d_logits[i, k]
-                    logit += jac.opacity_curvature[e, j] * u[j]
+            pull_back_geometry(jac, e, y, bar, h)
             if second_order:
-                for j in range(GEOMETRY):
-                    for l in range(GEOMETRY):
-                        h[l] += curvature[j, l] * u[j]
-                logit += jac.logit_curvature[e] * d_logits[i, k]
+                logit = add_curvature(jac, e, curvature, u, d_logits[i, k], h, logit)
             out_logits[i, k] += logit
             for b in range(bands):
                 slope, weight = jac.slope[e, b], out_means.dtype.type(0)
