@@ -137,17 +137,17 @@ def sum_windows(params, splat, channel, box, frame, size, footprints, planes, wo
     L = lanes(params)
     pitch = vectors * L + 2 * EDGE
     sums[:], total[:] = 0, 0
-    for y in range(y0 - 2 * REACH, y0):
+    for y in range(y0 - 2 * REACH, y0):  # the rows above the splat
         clear_row(ring, y, vectors, pitch, L)
     unflushed, a = 0, footprints[0].splat_start[splat]
-    for ahead in range(y0, y1 + 2 * REACH + 1):
+    for ahead in range(y0, y1 + 2 * REACH + 1):  # the row that comes into the ring
         clear_row(ring, ahead, vectors, pitch, L)
         if ahead <= y1:
             a = fill_row(params, splat, channel, ahead, box, frame, size[1], footprints, a, planes, work)
-        row = ahead - REACH
+        row = ahead - REACH  # of the windows' centres: all of their rows are there now
         if row < 0 or row >= size[0]:
             continue
-        lo, hi = hull_of(spans, max(row - REACH, y0), min(row + REACH, y1))
+        lo, hi = hull_of(spans, max(row - REACH, y0), min(row + REACH, y1))  # of the splat within these windows
         if hi < 0:
             continue
         lo, hi = lo - left, hi - left
@@ -172,7 +172,10 @@ def clear_row(ring, y, vectors, pitch, L):
 
 @formula
 def fill_row(params, splat, channel, y, box, frame, image_width, footprints, a, planes, work):
-    """Write row y of the fields to the ring; the splat's first accumulator in this row of tiles.  a: one at or before it."""
+    """Write row y of the fields to the ring; return the splat's first accumulator in this row of tiles.
+
+    a: that of the row before, or the splat's first; accumulators are in order of their tiles' rows.
+    """
     ring, _rows, corners, spans, _moved, _sums = work
     _y0, _y1, left, vectors = box
     layout, begin, values = footprints
