@@ -22,7 +22,7 @@ Wholes:
     compositing         forward and backward + reduce
     rasterizer          bin to forward, slots, backward + reduce
     gradient            every stage
-    gradient, autograd  the same as a training makes it, through torch
+    gradient, autograd  the same through the graph of torch, as the loss of a probed viewpoint has it
     gradient, atomic    ... with sums by atomic additions (on a GPU)
     gsplat              ... by that package's kernels (on a GPU)
     linearize           what `LinearizedView` does once
@@ -117,7 +117,7 @@ class ViewBench:
         return projected_vjp(self.workload.gaussians, self.lens, splats, drawn, bar)
 
     def gradient_by_autograd(self, accumulation: Accumulation = "deterministic") -> torch.Tensor:
-        """Gradient as a step of a training computes it, through torch."""
+        """The gradient through the graph of torch."""
         w, settings = self.workload, replace(self.workload.settings, accumulation=accumulation)
         flat = self.like.clone().requires_grad_()
         image = render(w.gaussians.with_flat(flat), self.view.camera, self.background, settings).image

@@ -13,6 +13,7 @@ import torch
 from splat.losses.reference import LossSettings, photometric_loss
 from splat.model.settings import RenderSettings
 from splat.projection.antialias import sampling_widths
+from splat.raster.dispatch import rasterize
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.scenes.scene import load_scene
@@ -298,11 +299,11 @@ def test_random_backgrounds_show_through_views_as_through_renders():
 def test_a_random_background_is_drawn_anew_at_each_step(monkeypatch):
     colours = []
 
-    def recorded(gaussians, camera, background, settings, **others):
+    def recorded(splats, depths, drawn, background, *others):
         colours.append(tuple(background.tolist()))
-        return render(gaussians, camera, background, settings, **others)
+        return rasterize(splats, depths, drawn, background, *others)
 
-    monkeypatch.setattr("splat.render.loss_and_gradient.render", recorded)
+    monkeypatch.setattr("splat.render.loss_and_gradient.rasterize", recorded)
     run(TrainConfig(4, random_background=True))
     assert len(set(colours)) == 4
     colours.clear()

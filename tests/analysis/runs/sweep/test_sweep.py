@@ -29,7 +29,7 @@ from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from splat.losses.reference import LossSettings
 from splat.model.untrusted import locked
-from splat.render.render import render
+from splat.raster.dispatch import rasterize
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
@@ -95,14 +95,14 @@ def finished(folder) -> Sweep:
     sweep = read_sweep(written(folder, "[1, 0]", "[1]", "finished.toml"))
     steps = []
 
-    def press(*given, **others):
+    def press(*given):
         steps.append(1)
         if len(steps) == 3:
             os.kill(os.getpid(), signal.SIGINT)
-        return render(*given, **others)
+        return rasterize(*given)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("splat.render.loss_and_gradient.render", press)
+        patch.setattr("splat.render.loss_and_gradient.rasterize", press)
         assert main(arguments("train", sweep.cells[0].training)) == 130
     assert load_checkpoint(sweep.cells[0].out / "checkpoint.pt").training.step == 3
     assert main(["sweep", str(sweep.file), "--jobs", "2"]) == 0
