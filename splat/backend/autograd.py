@@ -10,15 +10,14 @@ class _Last(torch.autograd.Function):
     """The first `count` tensors, on the graph of them all, with a derivative that is an error."""
 
     @staticmethod
-    def forward(ctx, refusal: str, count: int, *tensors: Tensor):
-        ctx.refusal = refusal
+    def forward(_ctx, count: int, *tensors: Tensor):
         return tensors[:count]
 
     @staticmethod
-    def backward(ctx, *outputs: Tensor):
-        raise NotImplementedError(ctx.refusal)
+    def backward(_ctx, *_outputs: Tensor):
+        raise NotImplementedError(THIRD)
 
 
-def last_derivative(values: tuple[Tensor, ...], *sources: Tensor, refusal: str = THIRD) -> tuple[Tensor, ...]:
+def last_derivative(values: tuple[Tensor, ...], *sources: Tensor) -> tuple[Tensor, ...]:
     """Derivatives by a kernel: on the graph of what they came from, so that the next is refused, not taken for 0."""
-    return _Last.apply(refusal, len(values), *values, *sources)  # pyright: ignore[reportReturnType]
+    return _Last.apply(len(values), *values, *sources)  # pyright: ignore[reportReturnType]

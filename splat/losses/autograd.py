@@ -1,6 +1,6 @@
 """The losses of `losses.py` by the kernels, as torch functions and for the second-order renderer.
 
-`loss_against` and `consistency_loss` alone decide which kernels these are: those where the images are.
+`loss_against` and `loss_between` alone decide which kernels these are: those where the images are.
 """
 
 from dataclasses import dataclass
@@ -23,6 +23,15 @@ def loss_against(target: Float[Tensor, "3 h w"], settings: LossSettings, like: T
 
         return CudaViewLoss(target.to(like.device), settings, like.dtype)
     return CpuViewLoss(target, settings, like.dtype)
+
+
+def loss_between(image: Float[Tensor, "3 h w"], settings: LossSettings) -> ImageLoss:
+    """The loss of two images of the size, dtype and device of this one."""
+    if by_triton(image):
+        from splat.losses.cuda.loss import CudaImageLoss
+
+        return CudaImageLoss(image.detach(), settings)
+    return CpuImageLoss(image.shape, settings, NUMPY[image.dtype])
 
 
 class _Photometric(torch.autograd.Function):
@@ -66,38 +75,3 @@ def view_loss(image: Float[Tensor, "3 h w"], loss: ViewLoss | Clamped) -> Float[
     if isinstance(loss, Clamped):
         return view_loss(image.clamp(0, 1), loss.loss)
     return _Photometric.apply(image, loss)  # pyright: ignore[reportReturnType]
-
-
-SECOND = "expected one derivative of the consistency of two images, got a second; use photometric_loss for more"
-
-
-class _Consistency(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x: Tensor, y: Tensor, loss: ImageLoss) -> Tensor:
-        value, gradients = loss.consistency(loss.padded(x), loss.padded(y))
-        needed = zip(ctx.needs_input_grad, gradients, strict=False)
-        ctx.gradients = [loss.cropped(gradient) for need, gradient in needed if need]
-        ctx.save_for_backward(x, y)
-        return value
-
-    @staticmethod
-    def backward(ctx, *outputs: Tensor):
-        values = tuple(outputs[0].detach() * gradient for gradient in ctx.gradients)
-        found = iter(last_derivative(values, *ctx.saved_tensors, outputs[0], refusal=SECOND))
-        return tuple(next(found) if needed else None for needed in ctx.needs_input_grad)
-
-
-def consistency_loss(x: Float[Tensor, "3 h w"], y: Float[Tensor, "3 h w"], settings: LossSettings) -> Float[Tensor, ""]:
-    """The loss between two images that both depend on the parameters: symmetric, once differentiable in each.
-
-    In float32 its gradients are within 1e-6 of their norms of those in float64 (renders of a trained scene and of the scene
-    with its parameters changed, images 0.002 to 0.14 apart: 2e-7 to 8e-7).
-    """
-    if (x.shape, x.dtype) != (y.shape, y.dtype):
-        kinds = " and ".join(f"{tuple(image.shape)} of {image.dtype}" for image in (x, y))
-        raise ValueError(f"expected two images of one shape and dtype, got {kinds}; render both alike")
-    if by_triton(x):
-        from splat.losses.cuda.loss import CudaImageLoss
-
-        return _Consistency.apply(x, y, CudaImageLoss(x.detach(), settings))  # pyright: ignore[reportReturnType]
-    return _Consistency.apply(x, y, CpuImageLoss(x.shape, settings, NUMPY[x.dtype]))  # pyright: ignore[reportReturnType]

@@ -1,6 +1,6 @@
 """The photometric loss of one view and its gradient in the stored parameters: one pass to the image and one back.
 
-The numbers are those of `torch.autograd.grad` of `view_loss` through `render`, to the bit, without torch's graph between.
+The numbers are those of `torch.autograd.grad` through `render`, to the bit, without torch's graph between.
 """
 
 from dataclasses import dataclass
@@ -32,6 +32,47 @@ class LossAndGradient:
     splats: Splats
 
 
+class ViewPass:
+    """One view, rendered for a gradient: the planes of `raster`, the splats as composited, and the pass back.
+
+    opacity_scale: see `render`.  Raises InputError where a parameter or the background is not finite.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Float[Tensor, "3"],
+        settings: RenderSettings = RenderSettings(),
+        opacity_scale: Float[Tensor, " n"] | None = None,
+    ):
+        gaussians.require_finite()
+        self._gaussians, self._lens = gaussians.with_flat(gaussians.flat.detach()), lens_of(camera, settings)
+        self._splats, self._depths, self._drawn = projected(self._gaussians, self._lens)
+        self._opacity_scale = opacity_scale
+        shown, size = self._scaled(self._splats), (camera.width, camera.height)
+        self.raster = rasterize(shown, self._depths, self._drawn, background_of(gaussians, background), *size, settings)
+
+    def _scaled(self, numbers: Float[Tensor, "n 9"]) -> Float[Tensor, "n 9"]:
+        """Splats, or their plain adjoints, with the opacities' column multiplied by opacity_scale."""
+        if self._opacity_scale is None:
+            return numbers
+        numbers = numbers.clone()
+        numbers[:, OPACITY] *= self._opacity_scale.to(numbers)
+        return numbers
+
+    @property
+    def splats(self) -> Splats:
+        means, conics, opacities, colours = self.raster.splats.split((2, 3, 1, 3), dim=1)
+        return Splats(means, conics, opacities[:, 0], colours, self._depths, self._drawn)
+
+    def pull_back(self, cotangent: Float[Tensor, "4 H W"]) -> tuple[Float[Tensor, " p"], Float[Tensor, "n 2"]]:
+        """The gradients in the stored parameters and in the splats' means, given that in the planes."""
+        bar = plain_gradient(self.raster.splats, self.raster.backward(cotangent).moments)
+        gradient = projected_vjp(self._gaussians, self._lens, self._splats, self._drawn, self._scaled(bar))
+        return gradient, bar[:, :2]
+
+
 def loss_and_gradient(
     gaussians: Gaussians,
     camera: Camera,
@@ -40,28 +81,11 @@ def loss_and_gradient(
     settings: RenderSettings = RenderSettings(),
     opacity_scale: Float[Tensor, " n"] | None = None,
 ) -> LossAndGradient:
-    """Loss and gradient; opacity_scale: see `render`.  Raises ValueError where a parameter is not finite."""
-    gaussians.require_finite()
-    gaussians, lens = gaussians.with_flat(gaussians.flat.detach()), lens_of(camera, settings)
-    splats, depths, drawn = projected(gaussians, lens)
-    shown = splats if opacity_scale is None else _scaled(splats, opacity_scale)
-    size, background = (camera.width, camera.height), background_of(gaussians, background)
-    raster = rasterize(shown, depths, drawn, background, *size, settings)
-    value, cotangent = _linearized(loss, raster.planes)
-    bar = plain_gradient(shown, raster.backward(cotangent).moments)
-    of_splats = bar if opacity_scale is None else _scaled(bar, opacity_scale)
-    gradient = projected_vjp(gaussians, lens, splats, drawn, of_splats)
-    means, conics, opacities, colours = shown.split((2, 3, 1, 3), dim=1)
-    return LossAndGradient(
-        value.item(), gradient, bar[:, :2], Splats(means, conics, opacities[:, 0], colours, depths, drawn)
-    )
-
-
-def _scaled(numbers: Float[Tensor, "n 9"], opacity_scale: Float[Tensor, " n"]) -> Float[Tensor, "n 9"]:
-    """Splats, or their plain adjoints, with the column of the opacities multiplied."""
-    numbers = numbers.clone()
-    numbers[:, OPACITY] *= opacity_scale.to(numbers)
-    return numbers
+    """Loss and gradient of a view; opacity_scale and errors: see `ViewPass`."""
+    view = ViewPass(gaussians, camera, background, settings, opacity_scale)
+    value, cotangent = _linearized(loss, view.raster.planes)
+    gradient, screen_gradient = view.pull_back(cotangent)
+    return LossAndGradient(value.item(), gradient, screen_gradient, view.splats)
 
 
 def _linearized(loss: ViewLoss | Clamped, planes: Float[Tensor, "4 H W"]) -> tuple[Tensor, Float[Tensor, "4 H W"]]:

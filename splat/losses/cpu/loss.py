@@ -88,6 +88,7 @@ class CpuImageLoss:
         self, x: Float[Tensor, "3 H W"], y: Float[Tensor, "3 H W"]
     ) -> tuple[Float[Tensor, ""], Float[Tensor, "2 3 H W"]]:
         gradients = self.planes(2)
+        gradients[:, :, self.frame.height :] = 0
         flat = *gradients.reshape(2, -1), np.empty(0, self.dtype)
         value = self._sweep(x.numpy().reshape(-1), y.numpy().reshape(-1), None, *flat)
         return x.new_tensor(value), torch.from_numpy(gradients)

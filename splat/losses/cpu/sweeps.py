@@ -195,6 +195,9 @@ def finish_pair(x, y, at, row, frame, slopes, loss, in_x, in_y, values):
                 one_bar, other_bar = pair_adjoint(one, other, slope, loss.structural, bm, bp, ba, bv)
             store(in_x, at + i, one_bar)
             store(in_y, at + i, other_bar)
+    if in_x is not None:
+        for i in range(frame.width, frame.stride):
+            in_x[at + i] = in_y[at + i] = 0
     return row_sum(values, frame.width)
 
 

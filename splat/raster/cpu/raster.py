@@ -39,12 +39,12 @@ class CpuRaster:
         self.dtype, self.thresholds = depths.numpy().dtype, thresholds_of(settings, depths.dtype)
         self.lists = self.bin(depths, drawn)
         self.intersections = self.lists.splat.size
-        lanes, limits = lanes_of(self.dtype), self.thresholds
+        lanes, scalar, limits = lanes_of(self.dtype), self.dtype.type, self.thresholds
         columns, tile_rows = -(-width // lanes), -(-height // TILE_ROWS)
         self.plane = (tile_rows * TILE_ROWS, columns * lanes)
         size = self.plane[0] * self.plane[1]
         self.frame = tile.Frame(
-            columns, self.plane[1], size, *map(self.dtype.type, (limits.alpha_max, limits.free, limits.floor)),
+            columns, self.plane[1], size, scalar(limits.alpha_max), scalar(limits.free), scalar(limits.floor),
             np.ascontiguousarray(background.numpy(), self.dtype), np.repeat(np.arange(TILE_ROWS, dtype=self.dtype), lanes),
         )  # fmt: skip
         self.params = aligned((len(splats) * tile.PARAMS,), self.dtype)

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.losses.autograd import consistency_loss
+from splat.losses.autograd import loss_between
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import on_screen
-from splat.render.render import render
+from splat.render.loss_and_gradient import ViewPass
 from splat.training.state import Step
 
 
@@ -28,13 +28,18 @@ def agreement_gradients(
 
     settings: of l, where it is not the loss of training.
     """
-    flats = [field.flat.detach().requires_grad_() for field in fields]
-    renders = [
-        render(field.with_flat(flat), camera, step.background, step.config.render, opacity_scale=scale)
-        for field, flat, scale in zip(fields, flats, opacity_scales, strict=True)
+    passes = [
+        ViewPass(field, camera, step.background, step.config.render, scale)
+        for field, scale in zip(fields, opacity_scales, strict=True)
     ]
-    if not any(on_screen(each.splats.detach(), camera).any() for each in renders):
+    if not any(on_screen(each.splats, camera).any() for each in passes):
         return None
-    loss = weight * consistency_loss(renders[0].image, renders[1].image, settings or step.config.loss)
-    first, second = torch.autograd.grad(loss, flats)
-    return first, second
+    first, second = (each.raster for each in passes)
+    loss = loss_between(first.crop(first.planes)[:3], settings or step.config.loss)
+    _, cotangents = loss.consistency(first.planes[:3], second.planes[:3])
+    of_alpha = torch.zeros_like(first.planes[3:])
+    each = [
+        view.pull_back(torch.cat([weight * cotangent, of_alpha]))[0]
+        for view, cotangent in zip(passes, cotangents, strict=True)
+    ]
+    return each[0], each[1]

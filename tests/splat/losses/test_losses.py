@@ -11,7 +11,7 @@ from scipy.ndimage import correlate1d
 from torch import Tensor
 
 from landscape.errors import InputError
-from splat.losses.autograd import consistency_loss, view_loss
+from splat.losses.autograd import loss_between, view_loss
 from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import WINDOW, LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map, window
 from tests.oracles import similarity_by_windows
@@ -218,7 +218,6 @@ def test_padding_and_alpha_have_no_derivative(settings, dtype):
 def test_threads_change_no_bit_and_products_may_overwrite_their_vectors(settings, monkeypatch):
     monkeypatch.setattr("splat.losses.cpu.loss.RINGS", 1 << 16)  # so that two vectors are two sweeps
     expected = truth((37, 53), settings)
-    x, y = expected.image.clone().requires_grad_(), expected.target.clone().requires_grad_()
 
     def everything() -> list[Tensor]:
         loss = CpuViewLoss(expected.target, settings, torch.float64)
@@ -226,8 +225,7 @@ def test_threads_change_no_bit_and_products_may_overwrite_their_vectors(settings
         tangents = torch.stack([loss.padded(v) for v in expected.v])
         over = torch.cat([tangents, tangents[:, :1]], dim=1)  # four planes, as the products have
         held.hvp(over, out=over)
-        consistency = consistency_loss(x, y, settings)
-        both = consistency.detach(), *torch.autograd.grad(consistency, (x, y))
+        both = consistency(expected.image, expected.target, settings)
         products = held.hvp(tangents), over, held.diagonal, *held.curvatures(tangents)
         return [torch.tensor(held.value), held.gradient, *products, *both]
 
@@ -280,6 +278,13 @@ def test_a_third_derivative_by_the_kernels_is_refused():
         torch.autograd.grad(value, x)
 
 
+def consistency(x: Tensor, y: Tensor, settings: LossSettings) -> tuple[Tensor, Tensor, Tensor]:
+    """The loss of two images by the kernels, and its gradients in both."""
+    loss = loss_between(x, settings)
+    value, (in_x, in_y) = loss.consistency(loss.padded(x), loss.padded(y))
+    return value, loss.cropped(in_x), loss.cropped(in_y)
+
+
 @cache
 def truth_of_both(size: tuple[int, int], settings: LossSettings) -> tuple[Tensor, Tensor, Tensor]:
     """The specification's value and its gradients in both images."""
@@ -293,44 +298,32 @@ def truth_of_both(size: tuple[int, int], settings: LossSettings) -> tuple[Tensor
 @each_case
 def test_consistency_has_the_specifications_value_and_gradients(size, settings, dtype):
     value, *gradients = truth_of_both(size, settings)
-    x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target(size))
-    found = consistency_loss(x, y, settings)
+    x, y = (picture.to(dtype) for picture in image_and_target(size))
+    found, *both = consistency(x, y, settings)
     assert found.item() == pytest.approx(value.item(), rel=IMAGE[dtype], abs=IMAGE[dtype])
-    assert consistency_loss(x.detach(), y.detach(), settings) == found
-    for got, expected in zip(torch.autograd.grad(found, (x, y)), gradients, strict=True):
+    for got, expected in zip(both, gradients, strict=True):
         assert got.dtype == dtype and relative_error(got, expected) < DERIVATIVE[dtype]
 
 
 @each_dtype
 @each_loss
 def test_consistency_is_symmetric_to_the_bit(settings, dtype):
-    x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target((37, 53)))
-    one, other = consistency_loss(x, y, settings), consistency_loss(y, x, settings)
-    assert one == other
-    for first, second in zip(torch.autograd.grad(one, (x, y)), torch.autograd.grad(other, (x, y)), strict=True):
-        assert torch.equal(first, second) and first.any()
+    x, y = (picture.to(dtype) for picture in image_and_target((37, 53)))
+    (one, in_x, in_y), (other, of_x, of_y) = consistency(x, y, settings), consistency(y, x, settings)
+    assert one == other and torch.equal(in_x, of_y) and torch.equal(in_y, of_x) and in_x.any() and in_y.any()
 
 
 @each_loss
-def test_an_image_that_depends_on_nothing_gets_no_gradient_of_consistency(settings):
-    x, y = image_and_target((17, 21))
-    x.requires_grad_()
-    both = torch.autograd.grad(consistency_loss(x, y.clone().requires_grad_(), settings), x)[0]
-    assert torch.equal(torch.autograd.grad(3 * consistency_loss(x, y, settings), x)[0], 3 * both)
-    assert torch.equal(torch.autograd.grad(3 * consistency_loss(y, x, settings), x)[0], 3 * both)
-
-
-def test_a_second_derivative_of_consistency_is_refused():
-    x, y = (picture.requires_grad_() for picture in image_and_target((9, 6)))
-    gradients = torch.autograd.grad(consistency_loss(x, y, LossSettings()), (x, y), create_graph=True)
-    for gradient in gradients:
-        with pytest.raises(NotImplementedError, match="expected one derivative of the consistency of two images"):
-            torch.autograd.grad((gradient**2).sum(), x, retain_graph=True)
-
-
-def test_consistency_of_images_of_two_sizes_is_refused():
-    with pytest.raises(ValueError, match="expected two images of one shape and dtype, got"):
-        consistency_loss(torch.rand(3, 8, 9), torch.rand(3, 9, 8), LossSettings())
+def test_consistency_reads_no_padding_and_leaves_0_in_its_own(settings):
+    x, y = image_and_target((37, 53))
+    loss = loss_between(x, settings)
+    planes = [loss.padded(x), loss.padded(y)]
+    expected = loss.consistency(*planes)
+    for plane in planes:
+        plane[:, 37:], plane[..., 53:] = 0.7, 0.3
+    value, gradients = loss.consistency(*planes)
+    assert value == expected[0] and torch.equal(gradients, expected[1])
+    assert not gradients[:, :, 37:].any() and not gradients[..., 53:].any() and gradients.shape[-2:] != (37, 53)
 
 
 def test_l1_has_no_slope_at_its_kink():

@@ -5,7 +5,7 @@ import torch
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
-from splat.losses.autograd import consistency_loss, loss_against, view_loss
+from splat.losses.autograd import loss_against, loss_between, view_loss
 from splat.losses.cuda.loss import CudaImageLoss, CudaViewLoss
 from splat.losses.reference import LossSettings, photometric_loss
 from tests.splat.losses.test_losses import SETTINGS, image_and_target, truth, truth_of_both
@@ -86,7 +86,6 @@ def test_autograd_reaches_the_kernels_on_the_gpu_twice(device, monkeypatch):
     expected = photometric_loss(x, target, SETTINGS[1])
     (gradient,), (truth,) = (torch.autograd.grad(each, x, create_graph=True) for each in (found, expected))
     products = [torch.autograd.grad((each * v).sum(), x)[0] for each in (gradient, truth)]
-    once = consistency_loss(x, target, SETTINGS[1])
-    (slope,) = torch.autograd.grad(once, x)
+    once, (slope, _) = loss_between(target, SETTINGS[1]).consistency(image, target)
     pairs = ((found, expected), (gradient, truth), products, (once, expected), (slope, truth))
     assert all(relative_error(one.detach().cpu(), other.detach().cpu()) < 1e-12 for one, other in pairs)

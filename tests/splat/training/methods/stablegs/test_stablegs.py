@@ -89,7 +89,7 @@ def test_a_probe_of_no_attribute_weighs_the_photometric_gradient_alone(monkeypat
     def never(*_, **__):
         raise AssertionError("was worked out for nothing")
 
-    for module, name in ((state, "loss_and_gradient"), (stablegs, "exact_traces"), (agreement, "render")):
+    for module, name in ((state, "loss_and_gradient"), (stablegs, "exact_traces"), (agreement, "ViewPass")):
         monkeypatch.setattr(module, name, never)
     settings = StableGS(warm_up=0, probe=ProbeSettings(attributes=()), viewpoint=ViewpointSettings(edge_rotation=False))
     step = first_step(settings)
@@ -101,7 +101,7 @@ def test_a_probe_of_no_attribute_weighs_the_photometric_gradient_alone(monkeypat
     ("weights", "renders"), [((1.0, 0.0), (1, 0)), ((0.0, 0.5), (0, 6)), ((0.0, 0.0), (0, 0)), ((1.0, 0.5), (1, 6))]
 )
 def test_a_loss_of_weight_0_is_not_rendered(monkeypatch, weights, renders):
-    calls = {"loss_and_gradient": 0, "render": 0}
+    calls = {"loss_and_gradient": 0, "ViewPass": 0}
 
     def counted(name, function):
         def call(*arguments, **settings):
@@ -110,7 +110,7 @@ def test_a_loss_of_weight_0_is_not_rendered(monkeypatch, weights, renders):
 
         return call
 
-    for module, name in ((state, "loss_and_gradient"), (agreement, "render")):
+    for module, name in ((state, "loss_and_gradient"), (agreement, "ViewPass")):
         monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
     asp, vsp = weights
     viewpoint = ViewpointSettings(edge_rotation=False)
@@ -125,7 +125,7 @@ def test_a_viewpoint_that_sees_nothing_adds_nothing(monkeypatch):
     step = first_step(StableGS(warm_up=0, asp_weight=0.0, probe=PROBE))
     away = replace(step.camera, centre=torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64))
     monkeypatch.setattr(stablegs, "composite_pose", lambda *_, **__: away)
-    monkeypatch.setattr(agreement, "consistency_loss", None)
+    monkeypatch.setattr(agreement, "loss_between", None)
     base = base_of(step)
     assert torch.equal(step.training.method.gradient(step, base).gradient, base.gradient)
 
