@@ -92,6 +92,12 @@ class TraceOf(Struct, kw_only=True):
         error = error if error is not None and math.isfinite(error) else 0.0
         return value - error, value + error
 
+    def exceeds(self, other: "TraceOf") -> bool:
+        """Whether |value| is larger than the other's by two standard errors of the difference; not where one is not known."""
+        given = [error for each in (self, other) for error in (each.standard_error, each.views_error)]
+        errors = [math.inf if error is None else error for error in given if error is not UNSET]
+        return abs(self.value or 0.0) - abs(other.value or 0.0) > 2 * math.hypot(*errors)
+
 
 class Trace(TraceOf, kw_only=True):
     """Trace of one attribute's block over its active parameters.  tau: sqrt(max(value, 0) / dim), its curvature scale."""

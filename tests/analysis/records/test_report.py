@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from analysis.probe.summary import summary
 from analysis.records import report
 from analysis.records.findings import findings
 from analysis.records.quantities import exponent_of
@@ -306,6 +307,18 @@ def test_most_is_over_half_and_what_the_error_does_not_separate_is_named():
     said = sentences(data)
     assert "Position carries the largest part of the curvature" in said and "carries most" not in said
     assert "does not separate it from rotation and colour (SH)." in said
+
+
+def test_attributes_have_no_order_where_an_error_is_not_known():
+    """That by the views left out is not, where one of several was measured."""
+    data, _ = synthetic()
+    line = summary(probe_of(data), Path())[2]
+    assert line.startswith("traces  position") and " > " in line
+    for trace in data["traces"].values():
+        trace["views_error"] = None
+    line = summary(probe_of(data), Path())[2]
+    assert " > " not in line and line.count(" ≈ ") == len(data["traces"]) - 1
+    assert "Its error does not separate it from" in sentences(data)
 
 
 @pytest.mark.parametrize(
