@@ -123,16 +123,16 @@ def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
 
 def largest_steps(data: ProbeRecord) -> tuple[str, str, float] | None:
     """The two attributes whose curvature changes the loss most in such a step (`shares_per_trace`), and the ratio of the
-    changes; None where not known, or where the first one's interval overlaps another."""
-    ends = {
-        name: [abs(share * x) for x in data.traces[name].interval] for name, share in shares_per_trace(data).items()
-    }
-    if len(ends) < 2:
+    changes; None where not known, or where the errors leave open whether another than the first one's is as large."""
+    shares, traces = shares_per_trace(data), data.traces
+    if len(shares) < 2:
         return None
-    first, second, *_ = sorted(ends, key=lambda name: -min(ends[name]))
-    if not min(ends[first]) > max(max(ends[name]) for name in ends if name != first) > 0:
+    least, largest = ({name: share * traces[name].magnitudes[i] for name, share in shares.items()} for i in (0, 1))
+    first, second, *_ = sorted(shares, key=lambda name: -least[name])
+    if not least[first] > max(largest[name] for name in shares if name != first) > 0:
         return None
-    return first, second, sum(ends[first]) / sum(ends[second])
+    changes = [sum(abs(shares[name] * x) for x in traces[name].interval) for name in (first, second)]
+    return first, second, changes[0] / changes[1]
 
 
 def _of_largest_step(first: str, second: str, ratio: float) -> Line:

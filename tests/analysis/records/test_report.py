@@ -199,6 +199,13 @@ def test_attributes_are_compared_by_the_optimisers_steps_where_their_intervals_a
     assert f"{expected} as much as one in position, the next." in said and "all absolute traces" not in said
     tiles = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
     assert tiles["the change of the loss by a step of the optimiser: log scale over position"] == f"{factor:.2g} : 1"
+    whole = data["traces"]["log_scales"]
+    data["traces"]["log_scales"] = whole | {"views_error": None}  # one of several views was measured
+    assert "optimiser" not in sentences(data)
+    width = 1e3 * whole["value"]  # not even the sign is known
+    data["traces"]["log_scales"] = whole | {"value": 0.0, "low": -width, "high": width, "sign": "undetermined"}
+    assert "optimiser" not in sentences(data)
+    data["traces"]["log_scales"] = whole
     data["steps"]["log_scales"] = 7e-3  # the same change as of positions, within the errors
     assert "optimiser" not in sentences(data) and "all absolute traces" in sentences(data)
 
