@@ -75,7 +75,7 @@ def command() -> NoReturn:
     """Run `main` in a process of its own, and end it with the exit code.
 
     The libraries' objects live as long as the process, so Python is told not to look for garbage among them.  torch's threads,
-    which by default spin for some milliseconds after each operation, sleep instead: they took the cores of the kernels' threads.
+    which by default spin for milliseconds after each operation, sleep instead: they took the cores of the kernels' threads.
     """
     gc.set_threshold(100_000)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is imported

@@ -20,16 +20,16 @@ Draw = Callable[[Path], list[str]]
 
 
 @contextmanager
-def drawing(module: str, *options: str) -> Iterator[Draw]:
-    """`python -m figures.MODULE OPTIONS` of a folder that is named later: the process loads its libraries meanwhile."""
-    command = [sys.executable, "-m", f"figures.{module}", *options, "-"]  # without a folder there is nothing to draw
+def drawing(module: str) -> Iterator[Draw]:
+    """`python -m figures.MODULE` of a folder that is named later: the process loads its libraries meanwhile."""
+    command = [sys.executable, "-m", f"figures.{module}", "-"]  # without a folder there is nothing to draw
     with _group(command) as process:
         yield lambda target: _said(process, str(target))
 
 
-def draw(module: str, target: Path, *options: str) -> list[str]:
-    """Run `python -m figures.MODULE OPTIONS TARGET`, a folder or a file; as `Draw` does."""
-    command = [sys.executable, "-m", f"figures.{module}", *options, str(target)]
+def draw(module: str, target: Path) -> list[str]:
+    """Run `python -m figures.MODULE TARGET`, a folder or a file; as `Draw` does."""
+    command = [sys.executable, "-m", f"figures.{module}", str(target)]
     with _group(command) as process:
         return _said(process)
 

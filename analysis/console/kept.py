@@ -25,6 +25,8 @@ from landscape.results import Progress
 from splat.training.checkpoint import write_atomically
 
 T = TypeVar("T")
+Task = Callable[[torch.Generator, Progress, list[str]], T]
+"""A stage's work: is given random numbers, whom to tell how far it is, and where to note what it leaves out."""
 DIGEST = hashlib.sha256().digest_size
 
 
@@ -44,9 +46,10 @@ class Entry(msgspec.Struct):
 class Kept:
     """Runs stages, or reads what they found before.
 
-    folder: None to keep nothing.  told: all that the numbers depend on, as text.  streams: names of all stages; each draws from
-    a stream of its own, so that its numbers do not depend on which others have run.  count: of products and such, so far.
-    deadline: by `monotonic`; a stage under way is then given up, one to come is not begun.
+    streams: names of all stages; each draws from a stream of its own, so that its numbers do not depend on which others have
+    run.  count: of products and such, so far.  folder: None to keep nothing.  identity: all that the numbers depend on, as
+    text; what was kept under another one is not read.  deadline: by `monotonic`; a stage under way is then given up, one to
+    come is not begun.
 
     notes, counts: of all stages; unreached: stages that time did not reach.
     """
@@ -58,11 +61,11 @@ class Kept:
         streams: Sequence[str],
         count: Callable[[], list[int]] = lambda: [],
         folder: Path | None = None,
-        told: str = "",
+        identity: str = "",
         deadline: float = inf,
     ) -> None:
         self.stages, self.folder, self.count, self.deadline = stages, folder, count, deadline
-        self.told = told.encode("utf-8", "surrogateescape")
+        self.identity = identity.encode("utf-8", "surrogateescape")
         self.streams = {name: spawn(generator) for name in streams}
         self.notes: list[str] = []
         self.counts: list[int] = []
@@ -73,13 +76,11 @@ class Kept:
         """Seconds until the deadline."""
         return max(self.deadline - monotonic(), 0.0)
 
-    def run(
-        self, name: str, kind: type[T], work: Callable[[torch.Generator, Progress, list[str]], T], partial: bool = False
-    ) -> T | None:
+    def run(self, name: str, kind: type[T], work: Task[T], ends_in_time: bool = False) -> T | None:
         """What the stage finds, or found before; None where time did not reach it.
 
-        work: is given random numbers, whom to tell how far it is, and where to note what it leaves out.  partial: it ends in
-        time by itself; what it has by then is returned but not kept.
+        ends_in_time: the work heeds the time left by itself; it is always done, and what it has at the deadline is returned but
+        not kept.
         """
         if (entry := self._read(name)) is not None:
             with suppress(msgspec.ValidationError):
@@ -87,18 +88,15 @@ class Kept:
                 self.stages.known(name, entry.seconds)
                 self._add(entry)
                 return value
-        if not partial and self.left == 0:
-            return self._give_up(name)
-        notes, before = [], self.count()
         try:
-            with self.stages.stage(name) as report:
-                value = work(self.streams[name], report if partial else self._timed(report), notes)
+            if not ends_in_time:
+                self._require_time()
+            value, entry = self._done(name, work, ends_in_time)
         except TimeUp:
-            return self._give_up(name)
-        counts = [after - first for after, first in zip(self.count(), before, strict=True)]
-        content = msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_plain))
-        entry = Entry(content, notes, counts, self.stages.timing[name])
-        if not (partial and self.left == 0):
+            self.unreached.append(name)
+            self.stages.plan.pop(name, None)
+            return None
+        if not (ends_in_time and self.left == 0):
             self._write(name, entry)
         self._add(entry)
         return value
@@ -107,21 +105,32 @@ class Kept:
         """Whether a stage's result is there from before."""
         return self._read(name) is not None
 
-    def _give_up(self, name: str) -> None:
-        self.unreached.append(name)
-        self.stages.plan.pop(name, None)
-
     def remove(self) -> None:
+        """Remove the folder."""
         if self.folder is not None:
             shutil.rmtree(self.folder, ignore_errors=True)
 
+    def _done(self, name: str, work: Task[T], ends_in_time: bool) -> tuple[T, Entry]:
+        """What the work finds, as it is and as it is kept."""
+        notes, before = [], self.count()
+        with self.stages.stage(name) as report:
+            value = work(self.streams[name], report if ends_in_time else self._timed(report), notes)
+        counts = [after - first for after, first in zip(self.count(), before, strict=True)]
+        content = msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_plain))
+        return value, Entry(content, notes, counts, self.stages.timing[name])
+
     def _timed(self, report: Progress) -> Progress:
+        """The same, and raises TimeUp at the deadline."""
+
         def timed(done: int, most: int, state: str) -> None:
             report(done, most, state)
-            if self.left == 0:
-                raise TimeUp
+            self._require_time()
 
         return timed
+
+    def _require_time(self) -> None:
+        if self.left == 0:
+            raise TimeUp
 
     def _add(self, entry: Entry) -> None:
         self.notes += entry.notes
@@ -146,7 +155,7 @@ class Kept:
 
     def _key(self, content: bytes) -> bytes:
         """Digest of the command and of the content, with which a file begins: it shows that both are the same and whole."""
-        return hashlib.sha256(self.told + b"\0" + content).digest()
+        return hashlib.sha256(self.identity + b"\0" + content).digest()
 
     def _file(self, name: str) -> Path:
         assert self.folder is not None

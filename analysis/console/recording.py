@@ -1,6 +1,6 @@
 """A record with its pictures: the one way in which the commands write what they found."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
 
@@ -18,16 +18,15 @@ def write_with_pictures(
     stages: Stages,
     start: float,
     drawn: Draw | None = None,
-    options: Sequence[str] = (),
 ) -> None:
     """Write the record into `folder`, draw its pictures, and add to data how long all took since `start` and what was said.
 
-    drawn: draws the pictures, where `drawing` has begun with it; else options: of the command that draws them.
+    drawn: draws the pictures, where `drawing` has begun with it.
     """
     data.timing = {"total": perf_counter() - start}
     write_record(folder, data, arrays)
     with stages.stage("pictures"):
-        data.notes += draw("make_all", folder, *options) if drawn is None else drawn(folder)
+        data.notes += draw("make_all", folder) if drawn is None else drawn(folder)
     # the pictures are drawn from the record; only now is it known how long they took
     data.timing = {**stages.timing, "total": perf_counter() - start}
     write_data(folder, data)

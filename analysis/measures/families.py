@@ -264,8 +264,8 @@ def _of_operator(
             report(done, len(names), state)
 
         dim = hessian.dim if name == WHOLE else hessian.blocks[name].stop - hessian.blocks[name].start
-        leads = {name: replace(_lead(hessian, name, scale, ends), trace=traces.get(name))}
-        found.append((name, dim, families(operator, stream, settings, [name], spaces, say, leads)[name]))
+        lead = Lead(_start(hessian, name, scale, ends), traces.get(name))
+        found.append((name, dim, families(operator, stream, settings, [name], spaces, say, {name: lead})[name]))
     report(len(names), len(names), "done")
     return found
 
@@ -278,24 +278,23 @@ def _traces(hessian: SceneHessian, scale: Tensor | None, generator: torch.Genera
     return {WHOLE: total_trace(found), **{name: total_trace({name: trace}) for name, trace in found.items()}}
 
 
-def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnds | None) -> Lead:
-    """Start vectors of a search: the known ends of the whole, else eigenvectors of the diagonal blocks of Gaussians.
+def _start(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnds | None) -> Tensor | None:
+    """Start vectors (n, k) of the search for the ends of a part: where the whole's are known these, else eigenvectors of the
+    diagonal blocks of Gaussians; None, for random ones, where these say nothing of the part's ends.
 
-    For both ends of the Hessian and of its block of rotations.  For the largest end alone of positions, whose smallest one
-    spreads over several Gaussians, and of Gauss-Newton, whose smallest is 0.
+    Of positions and of Gauss-Newton they say where the largest end is alone: the smallest one of positions spreads over
+    several Gaussians, that of Gauss-Newton is 0.
     """
-    if name not in (WHOLE, "means", "quats"):
-        return Lead()
     if name == WHOLE and ends is not None:
-        return Lead(torch.cat([ends.largest.vectors[:, :1], ends.smallest.vectors[:, :1]], dim=1))
-    objective = hessian.objective
+        return torch.cat([ends.largest.vectors[:, :1], ends.smallest.vectors[:, :1]], dim=1)
+    if name not in (WHOLE, "means", "quats"):
+        return None
+    objective, attribute = hessian.objective, None if name == WHOLE else name
     blocks, pixelwise = objective.approximate_blocks
     if hessian.gauss_newton:
         blocks = objective.pixelwise_blocks
-    known = BlockEigenvectors(objective, blocks, pixelwise, None if name == WHOLE else name, scale)
-    if hessian.gauss_newton or name == "means":
-        return Lead(known.steepest(1, 0))
-    return Lead(known.warm_start())
+    known = BlockEigenvectors(objective, blocks, pixelwise, attribute, scale)
+    return known.steepest(1, 0) if hessian.gauss_newton or name == "means" else known.warm_start()
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: SceneObjective) -> float:
@@ -310,20 +309,22 @@ def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: Scene
 def _fitted(
     objective: SceneObjective, options: FamilyOptions, seconds: float, product: float, notes: list[str]
 ) -> FamilySettings:
-    """The budget, as far as time and memory allow.  product: seconds of a product with a batch of vectors."""
-    settings, eigen = options.family, options.family.eigen
-    room = vectors_within(objective, options.memory)
+    """The budget of a family that is given so many seconds: basis and batch fit into memory, both searches into the time.
+
+    product: seconds of a product with a batch of vectors.  notes: gets sentences on what was cut down.
+    """
+    settings, room = options.family, vectors_within(objective, options.memory)
+    eigen, steps = settings.eigen, settings.steps
     basis = basis_within(eigen, room)
     if basis < eigen.basis:
         notes.append(f"the families' Lanczos kept {basis} vectors instead of {eigen.basis}, to stay within memory")
-    batch = max(1, min(settings.batch, room // settings.steps))
-    rounds = -(-settings.starts // batch)
-    steps = settings.steps
-    if rounds * steps * product > DENSITY_SHARE * seconds:
-        steps = max(FEWEST_STEPS, int(DENSITY_SHARE * seconds / (rounds * product)))
+    batch = max(1, min(settings.batch, room // steps))  # a run of the density keeps a vector a step
+    seconds_a_step = -(-settings.starts // batch) * product
+    if steps * seconds_a_step > DENSITY_SHARE * seconds:
+        steps = min(steps, max(FEWEST_STEPS, int(DENSITY_SHARE * seconds / seconds_a_step)))
         notes.append("some densities of the families took fewer steps than asked for, to stay within the time")
     eigen = replace(eigen, basis=basis, max_seconds=min(eigen.max_seconds, (1 - DENSITY_SHARE) * seconds))
-    return replace(settings, eigen=eigen, batch=batch, steps=min(steps, settings.steps))
+    return replace(settings, eigen=eigen, batch=batch, steps=steps)
 
 
 def _effects(rows: list[FamilyRow]) -> tuple[schema.Effect, ...]:

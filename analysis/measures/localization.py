@@ -20,6 +20,8 @@ from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.reference import NEEDLE, condition, on_screen, project
 
+HEAVIEST = 10  # Gaussians that are listed
+
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
@@ -74,14 +76,14 @@ def conditions(
     return Conditions(rendered, bare)
 
 
-def localize(vector: Float[Tensor, " p"], gaussians: Gaussians, conditions: Conditions, heaviest: int = 10) -> LivesOn:
+def localize(vector: Float[Tensor, " p"], gaussians: Gaussians, conditions: Conditions) -> LivesOn:
     """Localization of a vector laid out like `gaussians.flat`; conditions: of the same Gaussians."""
     mass = masses(vector, gaussians)
     if len(conditions.rendered) != len(gaussians):
         raise ValueError(f"expected conditions of {len(gaussians)} Gaussians, got {len(conditions.rendered)}")
     share = mass / mass.sum()
     needles, bare = conditions.rendered > NEEDLE, conditions.bare > NEEDLE
-    top = share.topk(min(heaviest, len(share)))
+    top = share.topk(min(HEAVIEST, len(share)))
     return LivesOn(
         attributes=mass_shares(vector, gaussians.blocks),
         participation=participation(mass),

@@ -38,6 +38,7 @@ from analysis.records.provenance import require_seed, versions
 from analysis.records.records import Arrays, ProbeRecord, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
 from analysis.train.source import of_trainer
+from landscape import EigenEnds
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import spawn
@@ -71,12 +72,13 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | 
 def _run(
     options: ProbeOptions, command: Sequence[str], drawn: Draw | None, device: torch.device, ranks: Ranks | None
 ) -> int:
-    out = options.out or options.checkpoint.parent / ("probe-quick" if options.quick else "probe")
+    """The probe in this process.  ranks: of the processes that share the views, where there are several."""
     start, begun = perf_counter(), monotonic()
-    settings, family_options = _settings(options), _family_options(options)
+    out = options.out or options.checkpoint.parent / ("probe-quick" if options.quick else "probe")
+    settings, families = _settings(options), _family_options(options)
     limit = inf if options.seconds is None else options.seconds
     if ranks is not None:
-        _require_same_in_all_processes(limit, family_options)
+        _require_same_in_all_processes(limit, families)
     writes = ranks is None or ranks.rank == 0
     console, unfinished = Console(stderr=True, quiet=not writes), out.with_name(f".{out.name}.unfinished")
     require_replaceable(out)
@@ -85,14 +87,10 @@ def _run(
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
+    after = {} if families is None else families.expected
     say(_introduction(scene, checkpoint, objective), console=console)
-    after = {} if family_options is None else family_options.expected
     say(_expected(objective, settings, after), console=console)
-    pictures = digests(scene.select(checkpoint.scene.train))
-    identity = (  # what the results depend on: kept ones of another identity are not read
-        f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {pictures} {settings} "
-        f"{options.seed} {device} {versions()}"
-    )
+    identity = _identity(options, settings, scene, checkpoint, device)
     # the folder is opened first, so that one that cannot be written is refused before anything is measured
     with (
         record_folder(out) if writes else nullcontext() as folder,
@@ -101,19 +99,15 @@ def _run(
         telling_needs(objective),
     ):
         generator = torch.Generator(device).manual_seed(options.seed)
-        kept, views, deadline = None if ranks else unfinished, checkpoint.all_views, begun + limit - DRAWING
-        found = measure(objective, settings, generator, stages, kept, identity, deadline, views, after)
+        found = measure(
+            objective, settings, generator, stages, None if ranks else unfinished, identity,
+            deadline=begun + limit - DRAWING, population=checkpoint.all_views, after=after,
+        )  # fmt: skip
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         data.steps = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
-        if family_options is not None:
-            from analysis.measures.families import measure_families
-
-            families = measure_families(
-                objective, checkpoint.training, family_options, spawn(generator), stages.stage, found.ends
-            )
-            data, arrays["families"] = families.added_to(data), families.arrays()
-            data.provenance.families = asdict(family_options)
+        if families is not None:
+            data = _with_families(data, arrays, families, objective, checkpoint, generator, stages, found.ends)
         data.notes += checkpoint.assumptions
         if folder is not None:
             _write(folder, data, arrays, objective, stages, start, drawn)
@@ -146,9 +140,38 @@ def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[No
         raise
 
 
-def _digest(path: Path) -> str:
-    with path.open("rb") as stream:
-        return file_digest(stream, "sha256").hexdigest()
+def _identity(
+    options: ProbeOptions, settings: ProbeSettings, scene: Scene, checkpoint: Checkpoint, device: torch.device
+) -> str:
+    """All that the results of stages depend on, as text: kept ones of another identity are not read."""
+    pictures = digests(scene.select(checkpoint.scene.train))
+    with options.checkpoint.open("rb") as stream:
+        content = file_digest(stream, "sha256").hexdigest()
+    return (
+        f"{content} {options.foreign} {options.loss} {scene.root} {pictures} {settings} {options.seed} {device} "
+        f"{versions()}"
+    )
+
+
+def _with_families(
+    data: ProbeRecord,
+    arrays: Arrays,
+    options: "FamilyOptions",
+    objective: SceneObjective,
+    checkpoint: Checkpoint,
+    generator: torch.Generator,
+    stages: Stages,
+    ends: EigenEnds,
+) -> ProbeRecord:
+    """Measure the families; returns the record with them, and adds theirs to the arrays."""
+    from analysis.measures.families import measure_families
+
+    training, stream = checkpoint.training, spawn(generator)
+    families = measure_families(objective, training, options, stream, stages.stage, ends)
+    arrays["families"] = families.arrays()
+    data = families.added_to(data)
+    data.provenance.families = asdict(options)
+    return data
 
 
 def _write(

@@ -20,6 +20,7 @@ seed alone, also those of stages kept from an earlier run.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from pathlib import Path
 
@@ -57,7 +58,7 @@ from landscape.slices.finite_probe import FiniteProbe, finite_probe
 from landscape.slices.grid_evaluations import Loss
 from landscape.slices.refinement import SliceSettings
 from landscape.spectrum.density import ActiveSpace
-from landscape.traces.trace import total_trace
+from landscape.traces.trace import TraceSettings, total_trace
 from splat.backend.cpu.threads import single_threaded, thread_count
 from splat.backend.device import by_triton
 from splat.curvature.block_eigenvectors import BlockEigenvectors
@@ -81,37 +82,28 @@ def measure(
     generator: torch.Generator,
     stages: Stages,
     folder: Path | None = None,
-    told: str = "",
+    identity: str = "",
     deadline: float = inf,
     population: int | None = None,
     after: Expected = NOTHING,
 ) -> Measured:
     """Run every stage.
 
-    folder, told, deadline: see `Kept`.  population: number of training views, where the objective has fewer.  after: stages
+    folder, identity, deadline: see `Kept`.  population: number of training views, where the objective has fewer.  after: stages
     that the caller runs afterwards.
     """
     with stages.stage("linearise") as report:
-        hessian = SceneHessian(objective)
-        operator = CountingOperator(hessian)
-        report(0, 1, f"{len(objective.views)} views")
-        gradient = objective.gradient
-        report(1, 1, f"{len(objective.views)} views")
-        value = objective.loss(objective.active.flat)
-        objective.approximate_blocks  # noqa: B018 (cached; its kernels compile in this stage)
-        if settings.block_coupling or not settings.trace_samples:
-            _compile_blocks(objective)
+        at = _linearised(objective, settings, report)
     with stages.stage("checks") as report:
-        operator_check = check_operator(operator, spawn(generator), settings.checked_vectors)
-        gradient_check = check_against_gradient(hessian, spawn(generator), report, settings.checked_views)
-    checks = operator.matvecs, hessian.views.spared
-    product, render = seconds_of_product(hessian), seconds_of_render(objective)
+        operator_check = check_operator(at.operator, spawn(generator), settings.checked_vectors)
+        gradient_check = check_against_gradient(at.hessian, spawn(generator), report, settings.checked_views)
+    of_checks = at.work()
+    product, render = seconds_of_product(at.hessian), seconds_of_render(objective)
     words = f"{MOST_AT_ONCE} products at once take {product:.2g} s, a render of all views {render:.2g} s"
-    kept = Kept(stages, generator, STAGES, lambda: [operator.matvecs, hessian.views.spared], folder, told, deadline)
+    kept = Kept(stages, generator, STAGES, at.work, folder, identity, deadline)
     plan = plan_of(settings, product, render, after)
     stages.expect({name: work for name, work in plan.items() if not kept.has(name)}, words)
-    point = _Point(objective, hessian, operator, settings, gradient, value)
-    return _all_stages(point, kept, operator_check, gradient_check, checks, population)
+    return _all_stages(at, kept, operator_check, gradient_check, of_checks, population)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,38 +117,56 @@ class _Point:
     gradient: Tensor
     value: float
 
+    def work(self) -> list[int]:
+        """Products H v so far, and products of single views that were known to be 0 and left out."""
+        return [self.operator.matvecs, self.hessian.views.spared]
+
+
+def _linearised(objective: SceneObjective, settings: ProbeSettings, report: Progress) -> _Point:
+    hessian = SceneHessian(objective)
+    views = f"{len(objective.views)} views"
+    report(0, 1, views)
+    gradient = objective.gradient
+    report(1, 1, views)
+    value = objective.loss(objective.active.flat)
+    objective.approximate_blocks  # noqa: B018 (cached; its kernels compile in this stage)
+    if settings.block_coupling or not settings.trace_samples:
+        _compile_blocks(objective)
+    return _Point(objective, hessian, CountingOperator(hessian), settings, gradient, value)
+
+
+def _compile_blocks(objective: SceneObjective) -> None:
+    """Compile the kernel of exact blocks, on one Gaussian, so that the stages that use it take the expected time."""
+    if objective.couples_pixels and not by_triton(objective.active.flat):
+        one = objective.active.select(torch.zeros(1, dtype=torch.int64))
+        objective.linearizer(one)(0).block_diagonals(approximate=False, parts=(False, True))
+
 
 def _all_stages(
     at: _Point,
     kept: Kept,
     operator_check: OperatorCheck,
     gradient_check: ProductCheck,
-    checks: tuple[int, int],
+    of_checks: list[int],
     population: int | None,
 ) -> Measured:
-    objective, settings = at.objective, at.settings
-    traces = kept.run("traces", dict[str, TraceEstimate], lambda g, report, _: _traces(at, kept.left, g, report), True)
-    ends = kept.run("eigenvalues", EigenEnds, lambda *given: _ends(at, kept.left, *given), True)
-    assert traces is not None and ends is not None  # partial stages always return something
-    plane = kept.run("slice", PlaneSlice | None, lambda *given: _plane(at, ends, *given))  # pyright: ignore[reportArgumentType]
+    """The stages after the checks.  of_checks: `_Point.work` that these took."""
+    settings = at.settings
+    traces = kept.run("traces", dict[str, TraceEstimate], partial(_traces, at, kept), ends_in_time=True)
+    ends = kept.run("eigenvalues", EigenEnds, partial(_ends, at, kept), ends_in_time=True)
+    assert traces is not None and ends is not None  # stages that end in time always return something
+    plane = kept.run("slice", PlaneSlice | None, partial(_plane, at, ends))  # pyright: ignore[reportArgumentType]
     spectrum = power = finite = depth = None
     if settings.density_matvecs:
-        spectrum = kept.run("density", Spectrum, lambda *given: _spectrum(at, ends, traces, *given))
+        spectrum = kept.run("density", Spectrum, partial(_spectrum, at, ends, traces))
     if settings.power_apart:
-        power = kept.run(
-            "power iteration", EigenEnds, lambda g, report, _: power_ends(at.operator, g, settings.power, report)
-        )
+        power = kept.run("power iteration", EigenEnds, partial(_power, at))
     if settings.probe_steps:
-        finite = kept.run("finite probe", FiniteProbe, lambda g, report, _: _finite(at, ends, report))
+        finite = kept.run("finite probe", FiniteProbe, partial(_finite, at, ends))
     if settings.depth is not None:
-        accuracy, steps = settings.depth, settings.depth_steps
-        depth = kept.run("depth", Depth, lambda g, report, _: measure_depth(objective, accuracy, steps, g, report))
-
-    def share(generator: torch.Generator, report: Progress, _: list[str]) -> list[BlockShare]:
-        return block_shares(objective, generator, settings.block_samples, report, coupled=settings.block_coupling)
-
-    shares = kept.run("block shares", list[BlockShare], share)
-    matvecs, spared = (first + more for first, more in zip(checks, kept.counts, strict=True))
+        depth = kept.run("depth", Depth, partial(_depth, at, settings.depth))
+    shares = kept.run("block shares", list[BlockShare], partial(_shares, at))
+    matvecs, spared = (sum(both) for both in zip(of_checks, kept.counts, strict=True))
     wanted = {"density": settings.density_matvecs, "finite probe": settings.probe_steps, "depth": settings.depth}
     return Measured(
         value=at.value,
@@ -185,16 +195,11 @@ def _left_out(at: _Point, ends: EigenEnds, population: int) -> LeftOut:
     return LeftOut(population, at.objective.losses, at.hessian.by_view(vectors))
 
 
-def _compile_blocks(objective: SceneObjective) -> None:
-    """Compile the kernel of exact blocks, on one Gaussian, so that the stages that use it take the expected time."""
-    if objective.couples_pixels and not by_triton(objective.active.flat):
-        one = objective.active.select(torch.zeros(1, dtype=torch.int64))
-        objective.linearizer(one)(0).block_diagonals(approximate=False, parts=(False, True))
-
-
-def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Progress) -> dict[str, TraceEstimate]:
+def _traces(
+    at: _Point, kept: Kept, generator: torch.Generator, report: Progress, _: list[str]
+) -> dict[str, TraceEstimate]:
     """Traces at their accuracy; on a CPU, those that need more than MOST_SAMPLES samples are summed over exact blocks."""
-    allowed, samples = replace(at.settings.traces, max_seconds=seconds), at.settings.trace_samples
+    allowed, samples = replace(at.settings.traces, max_seconds=kept.left), at.settings.trace_samples
     if samples or by_triton(at.objective.active.flat):
         return exact_traces(at.objective, generator, allowed, report, samples=samples)
     few = replace(allowed, max_probes=min(allowed.max_probes, MOST_SAMPLES))
@@ -204,8 +209,8 @@ def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Prog
     return {name: exact[name] if name in inexact else trace for name, trace in found.items()}
 
 
-def _ends(at: _Point, seconds: float, generator: torch.Generator, report: Progress, notes: list[str]) -> EigenEnds:
-    """Both ends of the spectrum, within `seconds` and with the largest basis that fits into memory."""
+def _ends(at: _Point, kept: Kept, generator: torch.Generator, report: Progress, notes: list[str]) -> EigenEnds:
+    """Both ends of the spectrum, in the time that is left and with the largest basis that fits into memory."""
     eigen, memory = at.settings.eigen, at.settings.memory
     basis = basis_within(eigen, vectors_within(at.objective, memory))
     if basis < eigen.basis:
@@ -214,7 +219,7 @@ def _ends(at: _Point, seconds: float, generator: torch.Generator, report: Progre
             "what was free"
         )
     start = BlockEigenvectors(at.objective, *at.objective.approximate_blocks).warm_start()
-    eigen = replace(eigen, max_seconds=seconds, basis=basis)
+    eigen = replace(eigen, max_seconds=kept.left, basis=basis)
     return extreme_eigenpairs(at.operator, generator, eigen, start, report)
 
 
@@ -246,11 +251,24 @@ def _spectrum(
     return Spectrum(density, iterates[0] if iterates else None)
 
 
-def _finite(at: _Point, ends: EigenEnds, report: Progress) -> FiniteProbe:
+def _power(at: _Point, generator: torch.Generator, report: Progress, _: list[str]) -> EigenEnds:
+    return power_ends(at.operator, generator, at.settings.power, report)
+
+
+def _finite(at: _Point, ends: EigenEnds, _: torch.Generator, report: Progress, __: list[str]) -> FiniteProbe:
     """Second differences of the loss along the first eigenvector."""
     center, vector = at.objective.active.flat, ends.largest.vectors[:, 0]
     steps, points = at.settings.probe_steps, at.settings.noise_points
     return finite_probe(at.objective.evaluate, center, vector, at.operator, steps, report, points)
+
+
+def _depth(at: _Point, accuracy: TraceSettings, generator: torch.Generator, report: Progress, _: list[str]) -> Depth:
+    return measure_depth(at.objective, accuracy, at.settings.depth_steps, generator, report)
+
+
+def _shares(at: _Point, generator: torch.Generator, report: Progress, _: list[str]) -> list[BlockShare]:
+    samples, coupled = at.settings.block_samples, at.settings.block_coupling
+    return block_shares(at.objective, generator, samples, report, coupled=coupled)
 
 
 def _plane(

@@ -1,7 +1,6 @@
 """A probe in six lines, for the terminal, and what has to be said beside them."""
 
 from itertools import pairwise
-from math import hypot
 from pathlib import Path
 
 from analysis.records.findings import Line, findings, is_open
@@ -48,15 +47,10 @@ def _ends(data: ProbeRecord) -> str:
 
 
 def _order(traces: dict[str, Trace]) -> str:
-    """Traces by size; ≈ between two that are within two standard errors of each other."""
+    """Traces by size; ≈ between two that are within two standard errors of each other, or whose errors are not known."""
     ranked = sorted(traces.items(), key=lambda item: -abs(item[1].value or 0.0))
     texts = [f"{SHORT.get(name, name)} {quantity(trace.value)}{apart(trace.views_error)}" for name, trace in ranked]
-    signs = []
-    for (_, first), (_, second) in pairwise(ranked):
-        gap = abs(first.value or 0.0) - abs(second.value or 0.0)
-        errors = (error or 0.0 for each in (first, second) for error in (each.standard_error, each.views_error))
-        error = hypot(*errors)
-        signs.append(" > " if gap > 2 * error else " ≈ ")
+    signs = [" > " if first.exceeds(second) else " ≈ " for (_, first), (_, second) in pairwise(ranked)]
     return "".join(part for pair in zip(texts, [*signs, ""], strict=True) for part in pair)
 
 

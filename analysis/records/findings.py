@@ -123,16 +123,16 @@ def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
 
 def largest_steps(data: ProbeRecord) -> tuple[str, str, float] | None:
     """The two attributes whose curvature changes the loss most in such a step (`shares_per_trace`), and the ratio of the
-    changes; None where not known, or where the first one's interval overlaps another."""
-    ends = {
-        name: [abs(share * x) for x in data.traces[name].interval] for name, share in shares_per_trace(data).items()
-    }
-    if len(ends) < 2:
+    changes; None where not known, or where the errors leave open whether another than the first one's is as large."""
+    shares, traces = shares_per_trace(data), data.traces
+    if len(shares) < 2:
         return None
-    first, second, *_ = sorted(ends, key=lambda name: -min(ends[name]))
-    if not min(ends[first]) > max(max(ends[name]) for name in ends if name != first) > 0:
+    least, largest = ({name: share * traces[name].magnitudes[i] for name, share in shares.items()} for i in (0, 1))
+    first, second, *_ = sorted(shares, key=lambda name: -least[name])
+    if not least[first] > max(largest[name] for name in shares if name != first) > 0:
         return None
-    return first, second, sum(ends[first]) / sum(ends[second])
+    changes = [sum(abs(shares[name] * x) for x in traces[name].interval) for name in (first, second)]
+    return first, second, changes[0] / changes[1]
 
 
 def _of_largest_step(first: str, second: str, ratio: float) -> Line:
@@ -152,14 +152,7 @@ def _of_largest_trace(traces: Mapping[str, schema.Trace], values: Mapping[str, f
         f"{measured(values[first], traces[first].standard_error)}, is {share:.0%} of the sum of all absolute traces (each in "
         "its own stored units)."
     )
-
-    def separated(name: str) -> bool:
-        """Whether |trace| of the first exceeds this one's by two standard errors of the difference."""
-        errors = [error for each in (first, name) for error in (traces[each].standard_error, traces[each].views_error)]
-        known = [math.inf if error is None or math.isnan(error) else error for error in errors if error is not UNSET]
-        return abs(values[first]) - abs(values[name]) >= 2 * math.hypot(*known)
-
-    if near := [attribute_name(name) for name in others if not separated(name)]:
+    if near := [attribute_name(name) for name in others if not traces[first].exceeds(traces[name])]:
         text += f" Its error does not separate it from {' and '.join(near)}."
     return Line(text)
 
@@ -357,17 +350,13 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
     """Sentences on a slice.  made: the provenance of its record."""
     if plane is None:
         return [Line("No slice of the loss was recorded.", "caution")]
-    lines, error, count = [], plane.interpolation_error, plane.holdout_points
+    lines = []
     rendered = plane.points if plane.evaluated_points is None else plane.evaluated_points
     if not plane.is_resolved:
         lines.append(Line(unresolved(plane, made), "caution"))
     elif rendered < plane.points:
         text = f"Of the slice's {plane.points:,} points {rendered:,} are renders, among them all of both axes; the others are "
-        text += f"interpolated{_to_tolerance(plane)}"
-        seen = error if plane.error_seen in (None, UNSET) else plane.error_seen
-        size = f"at most {100 * seen:.2g}%" if seen is not None else "without bound"
-        text += f" (the error at {count} random point{'' if count == 1 else 's'}: {size}"
-        lines.append(Line(f"{text}; the bound for all: {100 * error:.2g}%)." if error is not None else f"{text})."))
+        lines.append(Line(f"{text}interpolated{_to_tolerance(plane)} ({_errors_of_interpolation(plane)})."))
     if plane.crossed_points:
         share = f"{plane.crossed_points:,} of the slice's {rendered:,} rendered points"
         text = f"At {share} the order of the splats or the set of visible ones is not the checkpoint's"
@@ -375,13 +364,21 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
     return lines
 
 
+def _errors_of_interpolation(plane: schema.Slice) -> str:
+    bound, count = plane.interpolation_error, plane.holdout_points
+    seen = bound if plane.error_seen in (None, UNSET) else plane.error_seen
+    size = "without bound" if seen is None else f"at most {100 * seen:.2g}%"
+    text = f"the error at {count} random point{'' if count == 1 else 's'}: {size}"
+    return text if bound is None else f"{text}; the bound for all: {100 * bound:.2g}%"
+
+
 def unresolved(plane: schema.Slice, made: Provenance) -> str:
     """Why a plane is not drawn, and the command that resolves it."""
     limited = "--max-renders" in (made.command or "")
-    remedy = "leave out --max-renders" if limited else f"landscape slice {made.checkpoint} renders more"
+    resolving = "leave out --max-renders" if limited else f"landscape slice {made.checkpoint} renders more"
     return (
         f"Between its two sections the plane is not known{_to_tolerance(plane)} from {plane.evaluated_points:,} of "
-        f"{plane.points:,} renders, and no surface is drawn; {remedy}."
+        f"{plane.points:,} renders, and no surface is drawn; {resolving}."
     )
 
 

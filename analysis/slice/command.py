@@ -63,7 +63,7 @@ from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomica
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
 
-def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
+def run_slice(options: SliceOptions, command: Sequence[str]) -> int:
     """Slice the checkpoint's loss; returns the exit code.  command: as typed, for the record."""
     with staying_within(size_of(options.memory)):
         return _run(options, command)

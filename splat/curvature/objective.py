@@ -67,6 +67,20 @@ class ActiveCounts:
     radial_quaternions: int
     views: int
 
+    @classmethod
+    def of(cls, gaussians: Gaussians, active: Gaussians, views: int) -> "ActiveCounts":
+        """gaussians: all that are given, with all their SH bands; active: with those in use."""
+        return cls(
+            gaussians=len(gaussians),
+            active_gaussians=len(active),
+            parameters=gaussians.flat.numel(),
+            active_parameters=active.flat.numel() - len(active),
+            sh_degree=gaussians.sh_degree,
+            active_sh_degree=active.sh_degree,
+            radial_quaternions=len(active),
+            views=views,
+        )
+
 
 @dataclass(frozen=True)
 class Needs:
@@ -127,55 +141,42 @@ class SceneObjective:
             raise InputError("expected at least one view, got none")
         gaussians.require_finite()
         gaussians = gaussians.with_flat(gaussians.flat.detach())
-        flat, degree = gaussians.flat, gaussians.sh_degree if sh_degree is None else sh_degree
-        setup = (len(gaussians), flat.dtype, degree, loss_settings, background, settings, keep_unseen)
-        ranks.require_same("set-up", setup)
-        ranks.require_same_vectors(flat[:, None])
-        if gaussians.filter_widths is not None:
-            ranks.require_same_vectors(gaussians.filter_widths[:, None])
+        degree = gaussians.sh_degree if sh_degree is None else sh_degree
+        _require_same(ranks, gaussians, degree, loss_settings, background, settings, keep_unseen)
         self.views, self.loss_settings, self.ranks = tuple(views), loss_settings, ranks
         self._views_of_ranks = [int(count) for count in ranks.gather(torch.tensor(len(views)))]
         # products give the same bits each time, even where the training's steps do not
         self.settings = replace(settings, accumulation="deterministic")
         self.background = background_of(gaussians, background)
-        self._losses = [loss_against(view.image, loss_settings, flat) for view in views]
+        self._losses = [loss_against(view.image, loss_settings, gaussians.flat) for view in views]
         used = gaussians.select(torch.arange(len(gaussians)), degree)
-        self.mask: Bool[Tensor, " n"] = self._seen(used)
-        if not self.mask.any():
+        seen, self._sizes = self._first_look(used)
+        if not seen.any():
             raise NothingInSight(f"expected Gaussians in sight, got {len(gaussians)} of which no view sees any")
-        if keep_unseen:
-            self.mask = torch.ones_like(self.mask)
+        self.mask: Bool[Tensor, " n"] = torch.ones_like(seen) if keep_unseen else seen
         self.active = used.select(self.mask)
-        regularized = loss_settings.opacity_reg or loss_settings.scale_reg  # else the unseen need not be copied
-        self._unseen = (
-            Regularizers(used.select(~self.mask), loss_settings, len(gaussians)).value if regularized else 0.0
-        )
         quats = self.active.quats
         quats /= quats.norm(dim=1, keepdim=True)
-        self.counts = ActiveCounts(
-            gaussians=len(gaussians),
-            active_gaussians=len(self.active),
-            parameters=flat.numel(),
-            active_parameters=self.active.flat.numel() - len(self.active),
-            sh_degree=gaussians.sh_degree,
-            active_sh_degree=degree,
-            radial_quaternions=len(self.active),
-            views=sum(self._views_of_ranks),
-        )
-        sharing = 1 if flat.device.type == "cuda" else ranks.size
-        if memory is None:
-            free = free_memory(flat.device) // sharing
-            memory = min(free // 2, max(free - self.needs.beside, self.needs.view))
-        self._memory = memory
+        self._unseen = 0.0  # share of the inactive ones in R
+        if loss_settings.opacity_reg or loss_settings.scale_reg:  # else they need not be copied
+            self._unseen = Regularizers(used.select(~self.mask), loss_settings, len(gaussians)).value
+        self.counts = ActiveCounts.of(gaussians, self.active, sum(self._views_of_ranks))
+        self._memory = self._memory_of_views() if memory is None else memory
 
-    def _seen(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
-        """Mask of the Gaussians that touch a pixel of some view of any rank."""
-        seen, self._sizes = gaussians.flat.new_zeros(len(gaussians), dtype=torch.bool), (0, 0, 0)
+    def _first_look(self, gaussians: Gaussians) -> tuple[Bool[Tensor, " n"], tuple[int, int, int]]:
+        """Mask of those that touch a pixel of some view of any rank; `LinearizedView.size_of` the largest view of this one."""
+        seen, sizes = gaussians.flat.new_zeros(len(gaussians), dtype=torch.bool), (0, 0, 0)
         for view in self.views:
             raster = rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True)
             seen |= touches(raster)
-            self._sizes = max(self._sizes, LinearizedView.size_of(raster, gaussians, self.settings))
-        return self.ranks.any(seen)
+            sizes = max(sizes, LinearizedView.size_of(raster, gaussians, self.settings))
+        return self.ranks.any(seen), sizes
+
+    def _memory_of_views(self) -> int:
+        """Bytes free to this rank, less those needed beside the views: those of one view at least, half of the free at most."""
+        device = self.active.flat.device
+        free = free_memory(device) // (1 if device.type == "cuda" else self.ranks.size)
+        return min(free // 2, max(free - self.needs.beside, self.needs.view))
 
     @property
     def needs(self) -> "Needs":
@@ -344,3 +345,11 @@ class SceneObjective:
     def pixelwise_blocks(self) -> PerGaussianBlocks:
         """The blocks of the Gauss-Newton part with the diagonal of l'' in place of l''."""
         return self.block_diagonal(gauss_newton=True, approximate=True)
+
+
+def _require_same(ranks: Ranks, gaussians: Gaussians, *settings: object) -> None:
+    """Raise InputError on all ranks unless they have the same Gaussians and settings."""
+    ranks.require_same("set-up", (len(gaussians), gaussians.flat.dtype, *settings))
+    ranks.require_same_vectors(gaussians.flat[:, None])
+    if gaussians.filter_widths is not None:
+        ranks.require_same_vectors(gaussians.filter_widths[:, None])

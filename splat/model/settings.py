@@ -1,12 +1,11 @@
 """The thresholds of the renderer, and how a GPU accumulates sums, in one frozen object.
 
 Every threshold makes the image a discontinuous or merely piecewise smooth function of the parameters.  The default values are
-those of the original 3DGS rasterizer (Kerbl et al. 2023).  `SMOOTH` switches off the thresholds that can be switched off, so
-that a study can measure their effect on the landscape.
+those of the original 3DGS rasterizer (Kerbl et al. 2023).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from landscape.errors import InputError
@@ -74,9 +73,6 @@ class RenderSettings(Settings):
     def floor(self, dtype: "torch.dtype") -> float:
         """The transmittance beneath which a pixel of dtype stops: in float64 TIE above transmittance_min."""
         return self.transmittance_min * (1 + TIE if dtype.itemsize == 8 else 1)
-
-
-SMOOTH = replace(RenderSettings(), alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)
 
 
 def current_settings(stored: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,12 +5,14 @@ from torch import Tensor
 
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
+from splat.model.settings import RenderSettings
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.densify import DensifySettings
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig
 
+SMOOTH = RenderSettings(alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)  # no threshold that can be off
 WIDTH, HEIGHT, EXTENT = 20, 14, 2.0
 REFERENCE = SceneReference(
     "/nowhere/tiny", "../tiny", None, 1.0, ["view0", "view1", "view2"], [], [[WIDTH, HEIGHT]] * 3

@@ -64,15 +64,15 @@ class Truth:
         )
 
 
-def weighted_quantile(magnitudes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"], share: float = SHARE) -> float:
-    """Weighted quantile: the magnitude at or below which this share of the weight lies.
+def weighted_quantile(magnitudes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"]) -> float:
+    """The magnitude at or below which SHARE of the weight lies.
 
-    >>> weighted_quantile(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([3.0, 1.0, 2.0]), share=0.4)
+    >>> weighted_quantile(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([90.0, 4.0, 6.0]))
     2.0
     """
     ordered, order = magnitudes.sort()
     sums = weights[order].cumsum(0)
-    return float(ordered[int(torch.searchsorted(sums, share * sums[-1]).clamp_max(len(sums) - 1))])
+    return float(ordered[int(torch.searchsorted(sums, SHARE * sums[-1]).clamp_max(len(sums) - 1))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +148,9 @@ def _product(operator: SymmetricOperator, V: Tensor) -> Tensor:
 # --- random matrices --------------------------------------------------------------------------------------------------
 
 
-def spectra(n: int = ROWS) -> dict[str, Float64[Tensor, " n"]]:
+def spectra() -> dict[str, Float64[Tensor, " n"]]:
     """Spectra like those of curvature: a power law, clusters at the ends, both signs, few nonzero ones, none dominant."""
-    i = torch.arange(n, dtype=torch.float64)
+    n, i = ROWS, torch.arange(ROWS, dtype=torch.float64)
     ends = torch.where(i < 5, 1 - 1e-3 * i, torch.where(i >= n - 4, -0.3, 0.3 * i / n))
     return {
         "power law": (1 + i) ** -1.5,

@@ -46,6 +46,7 @@ from landscape.results import Progress
 from splat.backend.cpu.threads import single_threaded
 from splat.curvature.fields import FIELDS, Field, Values, scene_fields
 from splat.curvature.objective import SceneObjective
+from splat.model.gaussians import Gaussians
 from splat.render.sight import Sight
 from splat.scenes.view import View
 from splat.training.checkpoint import Checkpoint
@@ -88,18 +89,15 @@ def in_words(kind: Field, value: float) -> str:
 def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
     """Map the checkpoint; returns the exit code.  command: as typed, for the record; drawn: draws the pictures."""
     out, probe = options.out or options.checkpoint.parent / MAP, options.checkpoint.parent / PROBE
-    known = [*FIELDS, *ENDS]
-    if options.shown not in known:
-        raise InputError(
-            f"expected --field {', '.join(known)}, got {options.shown!r}{did_you_mean(options.shown, known)}"
-        )
-    console, start, notes = Console(stderr=True), perf_counter(), list[str]()
+    require_known_field(options.shown, [*FIELDS, *ENDS])
+    start, notes = perf_counter(), list[str]()
     require_replaceable(out, MapRecord.FILE)
-    stages = Stages(console)
+    stages = Stages(Console(stderr=True))
     with stages.stage("load"):
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         objective = scene_objective(checkpoint, scene)
         chosen = _chosen(options.draw, objective.views)
+    gaussians = checkpoint.training.gaussians
     with record_folder(out, MapRecord.FILE) as folder, stages, ThreadPoolExecutor(1) as beside:
         with stages.stage("fields") as report:
             found = measured_fields(objective, probe, notes, report)
@@ -115,21 +113,15 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
             panels = _write_panels(folder, objective, found, shades, chosen, report)
         with stages.stage("steepest") as report:
             shown = _write_ends(folder, objective, found, report)
-        shade, gaussians = shades[options.shown], checkpoint.training.gaussians
         with stages.stage("files"):
-            (folder / "fields.ply").write_bytes(fields_ply(gaussians, objective.mask, found.values))
-            coloured = coloured_ply(gaussians, objective.mask, shade, found.values[options.shown])
-            (folder / f"{options.shown}.ply").write_bytes(coloured)
-            top = top_table(objective, found.values, options.shown)
-            (folder / "top.csv").write_text(csv_text(top), encoding="utf-8")
+            first = _write_files(folder, gaussians, objective, found.values, shades[options.shown])
         with stages.stage("fragility"):
             fragile = swapping.result()
-        made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
         data = MapRecord(
             gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
             sentences=[f"{each.sentence} {each.rendered}" for each in shown] + fragility_sentences(fragile),
-            steepest=shown, fragility=fragile,
-            notes=notes + checkpoint.assumptions + _views_left_out(checkpoint), provenance=made,
+            steepest=shown, fragility=fragile, notes=notes + checkpoint.assumptions + _views_left_out(checkpoint),
+            provenance=provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene),
         )  # fmt: skip
         _write(folder, data)
         with stages.stage("pictures"):
@@ -140,8 +132,14 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         from analysis.records.report import write_report  # slow to import
 
         write_report(probe)  # its page shows the map's pictures
-    _conclude(data, {name: column[0] for name, column in top.items()}, found.kinds[options.shown], out)
+    _conclude(data, first, found.kinds[options.shown], out)
     return 0
+
+
+def require_known_field(name: str, known: Sequence[str]) -> None:
+    """InputError unless --field names one of these."""
+    if name not in known:
+        raise InputError(f"expected --field {', '.join(known)}, got {name!r}{did_you_mean(name, known)}")
 
 
 def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
@@ -210,6 +208,18 @@ def _write_ends(folder: Path, objective: SceneObjective, found: Fields, report: 
         shown.append(one)
         report(done + 1, len(found.ends), "directions")
     return shown
+
+
+def _write_files(
+    folder: Path, gaussians: Gaussians, objective: SceneObjective, values: Values, shade: Shade
+) -> dict[str, Any]:
+    """Write the splats and the table; returns the first row of the table, by column.  shade: of the field that is shown."""
+    field = shade.name
+    (folder / "fields.ply").write_bytes(fields_ply(gaussians, objective.mask, values))
+    (folder / f"{field}.ply").write_bytes(coloured_ply(gaussians, objective.mask, shade, values[field]))
+    top = top_table(objective, values, field)
+    (folder / "top.csv").write_text(csv_text(top), encoding="utf-8")
+    return {name: column[0] for name, column in top.items()}
 
 
 def _views_left_out(checkpoint: Checkpoint) -> list[str]:

@@ -13,6 +13,7 @@ Gaussians that no training view sees go first.  What --curve has measured is kep
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
@@ -59,6 +60,42 @@ Row = dict[str, str | int | float]
 
 def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
     """Prune the checkpoint; returns the exit code.  command: as typed, for the record."""
+    _require_sensible(options)
+    out = options.out or options.checkpoint.parent / "prune"
+    console, unfinished = Console(stderr=True), out.with_name(f".{out.name}.unfinished")
+    require_replaceable(out, RECORD)
+    stages = Stages(console)
+    with stages.stage("load"):
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
+        objective, l2 = (scene_objective(checkpoint, scene, loss=loss) for loss in (None, L2))
+        held_out = scene.load(checkpoint.scene.test) if checkpoint.scene.test else []
+    digest = sha256(options.checkpoint.read_bytes()).hexdigest()
+    identity = f"{digest} {replace(options, out=None, keep=1, score='', refine=0)}"
+    with record_folder(out, RECORD) as folder, stages:
+        kept = Kept(stages, torch.Generator().manual_seed(options.seed), STAGES, folder=unfinished, identity=identity)
+        with stages.stage("scores"):
+            scores = removal_scores(objective, l2)
+        ranks = _write_scores(folder, objective, scores, _truth(kept, objective, options))
+        curve = None
+        if options.curve:
+            curve = _curve(kept, checkpoint, objective, held_out, scores, options)
+            curve.to_csv(folder / "curve.csv", index=False)
+        with stages.stage("pruned"):
+            training = pruned(checkpoint.training, objective, scores[options.score], options.keep)
+            refine(training, objective.views, options.refine, options.seed)
+            scene_from_there = replace(checkpoint.scene, relative=os.path.relpath(scene.root, out.resolve()))
+            _write_pruned(folder, replace(checkpoint, training=training, scene=scene_from_there))
+        made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
+        (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
+        notes = draw_or_say("uses", folder) if curve is not None else []
+        result = _scored(training.gaussians, objective, held_out)
+    kept.remove()
+    _conclude(ranks, curve, training.gaussians, result, out)
+    say(*notes, style="yellow", console=console)
+    return 0
+
+
+def _require_sensible(options: PruneOptions) -> None:
     if not 0 < options.keep <= 1 or options.refine < 0 or options.curve_steps < 0 or options.sample < 3:
         raise InputError(
             f"expected --keep in (0, 1], steps of at least 0 and --sample of at least 3, got {options.keep:g}, "
@@ -68,46 +105,6 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
         raise InputError(
             f"expected --score {', '.join(SCORES)}, got {options.score!r}{did_you_mean(options.score, SCORES)}"
         )
-    out = options.out or options.checkpoint.parent / "prune"
-    console, unfinished = Console(stderr=True), out.with_name(f".{out.name}.unfinished")
-    require_replaceable(out, RECORD)
-    stages = Stages(console)
-    with stages.stage("load"):
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
-        objective, l2 = (scene_objective(checkpoint, scene, loss=loss) for loss in (None, L2))
-        held_out = scene.load(checkpoint.scene.test) if checkpoint.scene.test else []
-    told = f"{sha256(options.checkpoint.read_bytes()).hexdigest()} {replace(options, out=None, keep=1, score='', refine=0)}"
-    with record_folder(out, RECORD) as folder, stages:
-        kept = Kept(stages, torch.Generator().manual_seed(options.seed), STAGES, folder=unfinished, told=told)
-        with stages.stage("scores"):
-            scores = removal_scores(objective, l2)
-        errors = _truth(kept, objective, options)
-        table = pd.DataFrame({name: score.numpy() for name, score in scores.items()})
-        table.insert(0, "gaussian", objective.mask.nonzero()[:, 0].numpy())
-        table[TRUTH] = errors.numpy()
-        table.to_csv(folder / "scores.csv", index=False)
-        ranks = table.filter([TRUTH, *SCORES]).corr(method="spearman")
-        ranks.to_csv(folder / "correlations.csv")
-        curve = None
-        if options.curve:
-            curve = _curve(kept, checkpoint, objective, held_out, scores, options)
-            curve.to_csv(folder / "curve.csv", index=False)
-        with stages.stage("pruned"):
-            training = pruned(checkpoint.training, objective, scores[options.score], options.keep)
-            refine(training, objective.views, options.refine, options.seed)
-            reference = replace(checkpoint.scene, relative=os.path.relpath(scene.root, out.resolve()))
-            save_checkpoint(folder / "checkpoint.pt", training, reference)
-            file, _ = own_file(replace(checkpoint, training=training))
-            ply = splat_ply(file.gaussians, tool=file.tool, antialiased=file.antialiased)
-            (folder / "pruned.ply").write_bytes(ply)
-        made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
-        (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
-        notes = draw_or_say("uses", folder) if curve is not None else []
-        result = _scored(training.gaussians, objective, held_out)
-    kept.remove()
-    _conclude(ranks, curve, training.gaussians, result, out)
-    say(*notes, style="yellow", console=console)
-    return 0
 
 
 def pruned(training: Training, objective: SceneObjective, score: Float64[Tensor, " n"], keep: float) -> Training:
@@ -139,7 +136,7 @@ def refine(training: Training, views: Sequence[View], steps: int, seed: int) -> 
 
 
 def _truth(kept: Kept, objective: SceneObjective, options: PruneOptions) -> Float64[Tensor, " n"]:
-    """nan of those that are not in the sample."""
+    """The true rise of the loss by removing each Gaussian in sight; nan of those that are not in the sample."""
     n = len(objective.active)
     generator = torch.Generator().manual_seed(options.seed)
     chosen: Int64[Tensor, " m"] = torch.randperm(n, generator=generator)[: options.sample].sort().values
@@ -150,6 +147,26 @@ def _truth(kept: Kept, objective: SceneObjective, options: PruneOptions) -> Floa
     return errors
 
 
+def _write_scores(
+    folder: Path, objective: SceneObjective, scores: dict[str, Float64[Tensor, " n"]], errors: Float64[Tensor, " n"]
+) -> pd.DataFrame:
+    """Write the scores and the truth beside them, and return their rank correlations, written too."""
+    table = pd.DataFrame({name: score.numpy() for name, score in scores.items()})
+    table.insert(0, "gaussian", objective.mask.nonzero()[:, 0].numpy())
+    table[TRUTH] = errors.numpy()
+    table.to_csv(folder / "scores.csv", index=False)
+    ranks = table.filter([TRUTH, *SCORES]).corr(method="spearman")
+    ranks.to_csv(folder / "correlations.csv")
+    return ranks
+
+
+def _write_pruned(folder: Path, checkpoint: Checkpoint) -> None:
+    """Write the checkpoint, and its Gaussians as PLY."""
+    save_checkpoint(folder / "checkpoint.pt", checkpoint.training, checkpoint.scene)
+    file, _ = own_file(checkpoint)
+    (folder / "pruned.ply").write_bytes(splat_ply(file.gaussians, tool=file.tool, antialiased=file.antialiased))
+
+
 def _curve(
     kept: Kept,
     checkpoint: Checkpoint,
@@ -158,7 +175,11 @@ def _curve(
     scores: dict[str, Float64[Tensor, " n"]],
     options: PruneOptions,
 ) -> pd.DataFrame:
-    def points(name: str, steps: int, shares: Sequence[float], report: Progress) -> list[Row]:
+    """The scene's measures by score, share removed, and steps of training after it."""
+
+    def points(
+        name: str, steps: int, shares: Sequence[float], _: torch.Generator, report: Progress, __: list[str]
+    ) -> list[Row]:
         rows = []
         for done, removed in enumerate(shares):
             training = pruned(checkpoint.training, objective, scores[name], 1 - removed)
@@ -170,9 +191,9 @@ def _curve(
 
     rows: list[Row] = []
     for name in SCORES:
-        for steps, shares in ((0, REMOVED), *([(options.curve_steps, REFINED)] if options.curve_steps else [])):
-            stage = f"{name} refined" if steps else name
-            rows += kept.run(stage, list[Row], lambda _g, report, _n, a=(name, steps, shares): points(*a, report)) or []
+        rows += kept.run(name, list[Row], partial(points, name, 0, REMOVED)) or []
+        if steps := options.curve_steps:
+            rows += kept.run(f"{name} refined", list[Row], partial(points, name, steps, REFINED)) or []
     return pd.DataFrame(rows)
 
 
@@ -201,11 +222,8 @@ def _conclude(
     if columns:
         say(f"further columns: {measure.split('_')[0]} PSNR lost at that share removed, dB")
     table = Table()
-    for title in (
-        "score",
-        "rank",
-        *(f"{removed:.0%}{f', {steps} steps' if steps else ''}" for removed, steps in columns),
-    ):
+    titles = [f"{removed:.0%}{f', {steps} steps' if steps else ''}" for removed, steps in columns]
+    for title in ("score", "rank", *titles):
         table.add_column(title, justify="left" if title == "score" else "right")
     losses = [lost(curve, *at, measure) for at in columns] if curve is not None else []
     for name in SCORES:

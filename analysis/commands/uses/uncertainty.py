@@ -30,15 +30,17 @@ from analysis.records.json_files import json_text, plain
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError
 from splat.curvature.linearize import LinearizedView
-from splat.curvature.scores.information import prior_of
+from splat.curvature.scores.information import Information, prior_of
 from splat.curvature.scores.uncertainty import pixel_variance
 from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
+from splat.scenes.view import View
 
 RECORD = "uncertainty.json"  # the file by which a folder of results is known
 
+L2 = LossSettings("l2", ssim_weight=0)
 PRECISIONS = {"block": False, "diagonal": True}
-SHARES = 100
+SHARES = 100  # of the pixels that are taken away
 
 
 def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
@@ -63,16 +65,12 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
             total = total + prior_of(total)
         with stages.stage("views") as report:
             for place, view in enumerate(held_out):
-                loss = loss_against(view.image, LossSettings("l2", ssim_weight=0), gaussians.flat)
-                linearized = LinearizedView(gaussians, view.camera, loss, background, config.render)
-                error = (linearized.image.clamp(0, 1) - view.image).abs().mean(dim=0).double().numpy()
-                maps = {"photograph": view.image.permute(1, 2, 0).numpy(), "error": error}
-                for name, diagonal in PRECISIONS.items():
-                    variance = pixel_variance(linearized, total, generator, options.samples, diagonal=diagonal).numpy()
-                    maps[name] = np.sqrt(variance)
-                    rows.append({"view": view.name, "precision": name, **agreement(variance, error)})
-                arrays: dict[str, Any] = {key: each.astype(np.float32) for key, each in maps.items()}
-                np.savez(folder / f"view-{place:03d}.npz", **arrays)
+                linearized = LinearizedView(
+                    gaussians, view.camera, loss_against(view.image, L2, gaussians.flat), background, config.render
+                )
+                found, maps = _compared(linearized, view, total, generator, options.samples)
+                rows += found
+                np.savez(folder / f"view-{place:03d}.npz", **maps)
                 report(place + 1, len(held_out), "held-out views")
         table = pd.DataFrame(rows)
         table.to_csv(folder / "agreement.csv", index=False)
@@ -83,6 +81,19 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
     words = f"means over {len(held_out)} held-out views; agreement.csv, view-*.png in {out}"
     say(means.round(3).to_string(), words, *notes)
     return 0
+
+
+def _compared(
+    linearized: LinearizedView, view: View, total: Information, generator: torch.Generator, samples: int
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Rows of the table and maps of one held-out view.  total: B of `splat.curvature.scores.uncertainty`."""
+    error = (linearized.image.clamp(0, 1) - view.image).abs().mean(dim=0).double().numpy()
+    rows, maps = [], {"photograph": view.image.permute(1, 2, 0).numpy(), "error": error}
+    for name, diagonal in PRECISIONS.items():
+        variance = pixel_variance(linearized, total, generator, samples, diagonal=diagonal).numpy()
+        rows.append({"view": view.name, "precision": name, **agreement(variance, error)})
+        maps[name] = np.sqrt(variance)
+    return rows, {name: each.astype(np.float32) for name, each in maps.items()}
 
 
 def agreement(variance: Float[np.ndarray, "h w"], error: Float[np.ndarray, "h w"]) -> dict[str, float]:

@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from analysis.commands.map.command import ENDS, PROBE, measured_fields
+from analysis.commands.map.command import ENDS, PROBE, measured_fields, require_known_field
 from analysis.commands.options import ViewOptions
 from analysis.commands.view.page import offline_page
 from analysis.commands.view.viewer import APPEARANCE, Viewer
@@ -19,7 +19,7 @@ from analysis.measures.steepest import heaviest_view
 from analysis.probe.command import opened, scene_objective
 from analysis.slice.directions import RISE, UNITS, recorded_probe
 from landscape import curvature_reach
-from landscape.errors import InputError, did_you_mean
+from landscape.errors import InputError
 from splat.curvature.fields import FIELDS
 from splat.curvature.objective import SceneObjective
 from splat.training.checkpoint import write_atomically
@@ -29,23 +29,16 @@ STEEPEST = "e₁"
 
 def run_view(options: ViewOptions) -> int:
     """Show the checkpoint until Ctrl-C, or write a page; returns the exit code."""
-    viser, known = _viser(), (APPEARANCE, *FIELDS, *ENDS)
-    if options.shown not in known:
-        raise InputError(
-            f"expected --field {', '.join(known)}, got {options.shown!r}{did_you_mean(options.shown, known)}"
-        )
-    console = Console(stderr=True)
+    viser = _viser()
+    require_known_field(options.shown, (APPEARANCE, *FIELDS, *ENDS))
+    console, folder = Console(stderr=True), options.checkpoint.parent
     stages = Stages(console)
     with stages.stage("load"):
-        folder = options.checkpoint.parent
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, folder / "view")
         objective = scene_objective(checkpoint, scene)
         directions = steepest_directions(objective, folder / PROBE)
         start = heaviest_view(objective, directions[STEEPEST][0]) if STEEPEST in directions else 0
-    try:
-        server = viser.ViserServer(host=options.host, port=options.port, label="splat-landscape", verbose=False)
-    except OSError as error:
-        raise InputError(f"expected a free --port, got {options.port} ({error}); choose another") from error
+    server = _server(viser, options)
     try:
         viewer = Viewer(server, objective, start)
         if options.html is None:
@@ -54,19 +47,13 @@ def run_view(options: ViewOptions) -> int:
         with stages, stages.stage("fields") as progress:
             viewer.add_fields(measured_fields(objective, folder / PROBE, notes, progress), options.shown)
         say(*notes, style="yellow", console=console)
-        if options.html is not None:
+        if options.html is None:
+            viewer.add_steps(directions)
+            Event().wait()
+        else:
             write_atomically(options.html, offline_page(viewer, options.shown).encode())
             say(f"written: {options.html}", console=console)
-            from analysis.records import report  # half a second of imports
-
-            if (
-                options.html.resolve() == (folder / report.SPLATS).resolve()
-                and (folder / PROBE / report.FILE).is_file()
-            ):
-                report.write_report(folder / PROBE)  # its page has a link to this one
-            return 0
-        viewer.add_steps(directions)
-        Event().wait()
+            _link_from_report(folder, options.html)
     except KeyboardInterrupt:
         console.print("ended", highlight=False)
     finally:
@@ -81,6 +68,21 @@ def _viser() -> Any:
         raise InputError(
             f"expected the package viser, which shows a scene in the browser, got none ({error}); pip install -e '.[view]'"
         ) from None
+
+
+def _server(viser: Any, options: ViewOptions) -> Any:
+    try:
+        return viser.ViserServer(host=options.host, port=options.port, label="splat-landscape", verbose=False)
+    except OSError as error:
+        raise InputError(f"expected a free --port, got {options.port} ({error}); choose another") from error
+
+
+def _link_from_report(run: Path, page: Path) -> None:
+    """Write the probe's report anew, if there is one and the page lies where it links to."""
+    from analysis.records import report  # half a second of imports
+
+    if page.resolve() == (run / report.SPLATS).resolve() and (run / PROBE / report.FILE).is_file():
+        report.write_report(run / PROBE)
 
 
 def steepest_directions(objective: SceneObjective, probe: Path) -> dict[str, tuple[Tensor, float]]:

@@ -23,16 +23,17 @@ QUANTITIES = (
     *(f"{name}_{metric}" for metric in ("scene", "optimiser") for name in INDICES),
     "finite_curvature", "depth_gradient", "needles", "one_gaussian", "opacity_one_view",
 )  # fmt: skip
-DRAWS, LIMITS, LEAST = 2000, (0.025, 0.975), 5
+SEED, DRAWS, LIMITS = 0, 2000, (0.025, 0.975)  # of the bootstrap
+LEAST = 5
 
 
-def predictors(rows: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
+def predictors(rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each quantity and kind: quantity, kind, rho, low, high, n.
 
     Left out: kinds with fewer than LEAST runs or methods, and quantities that most runs lack, as the others' correlations would
     be over different runs.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
 
     def lines() -> Iterator[dict]:
         for name in QUANTITIES:

@@ -75,12 +75,12 @@ def information(
     return Information(geometry, sh, torch.cat([own.clamp_min(0), sh.flatten(1)], dim=1))
 
 
-def prior_of(seen: Information, share: float = PRIOR) -> Information:
+def prior_of(seen: Information) -> Information:
     """The prior's precisions, from the information of the training views."""
     diagonal, geometry = seen.geometry.diagonal(dim1=1, dim2=2), torch.zeros_like(seen.geometry)
     for columns in COLUMNS.values():
-        geometry.diagonal(dim1=1, dim2=2)[:, columns] = share * diagonal[:, columns].mean()
-    return Information(geometry, torch.full_like(seen.sh, share * float(seen.sh.mean())), torch.zeros_like(seen.summed))
+        geometry.diagonal(dim1=1, dim2=2)[:, columns] = PRIOR * diagonal[:, columns].mean()
+    return Information(geometry, torch.full_like(seen.sh, PRIOR * float(seen.sh.mean())), torch.zeros_like(seen.summed))
 
 
 def gains(seen: Information, prior: Information, candidate: Information) -> dict[str, float]:

@@ -36,9 +36,9 @@ class Work:
         return Found(vector, parts=(torch.ones(2, 3),), inner=Found(vector.float()), names={"a": 0.1})
 
 
-def kept(folder, told="this", work=None, **named):
+def kept(folder, identity="this", work=None, **named):
     count = (lambda: [work.count]) if work else (lambda: [])
-    return Kept(Stages(), torch.Generator().manual_seed(0), ["first", "second"], count, folder, told, **named)
+    return Kept(Stages(), torch.Generator().manual_seed(0), ["first", "second"], count, folder, identity, **named)
 
 
 def test_a_stage_that_was_kept_is_read_and_not_done_again(tmp_path):
@@ -75,7 +75,7 @@ def test_what_is_not_this_command_s_is_measured_again(tmp_path, harm):
         kept(tmp_path).run("first", dict[str, int], lambda *_: {"a": 1})
         assert kept(tmp_path).run("first", dict[str, str], lambda *_: {"a": "b"}) == {"a": "b"}
         return
-    kept(tmp_path, told="that" if harm == "another command" else "this").run("first", Found, work)
+    kept(tmp_path, identity="that" if harm == "another command" else "this").run("first", Found, work)
     assert work.count == 1
 
 
@@ -83,7 +83,7 @@ def test_time_that_ends_gives_a_stage_up_and_begins_no_other(tmp_path):
     work = Work()
     late = kept(tmp_path, deadline=0.0)
     assert late.run("first", Found, work) is None and work.count == 0 and late.unreached == ["first"]
-    assert late.run("second", Found, work, partial=True) is not None and not kept_stages(tmp_path)
+    assert late.run("second", Found, work, ends_in_time=True) is not None and not kept_stages(tmp_path)
 
     def slow(generator, report, notes):
         soon.deadline = 0.0

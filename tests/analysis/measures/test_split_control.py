@@ -7,9 +7,8 @@ from analysis.measures.split_control import halves, split_control, split_in_two
 from splat.curvature.objective import SceneObjective
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
-from splat.model.settings import SMOOTH
 from splat.render.render import render
-from tests.splat.tiny import tiny_gaussians, tiny_views
+from tests.splat.tiny import SMOOTH, tiny_gaussians, tiny_views
 
 CAMERA = Camera(torch.eye(3).double(), torch.zeros(3).double(), 80.0, 80.0, 32.0, 24.0, 64, 48)
 

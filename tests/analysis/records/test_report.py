@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from analysis.probe.summary import summary
 from analysis.records import report
 from analysis.records.findings import findings
 from analysis.records.quantities import exponent_of
@@ -198,6 +199,13 @@ def test_attributes_are_compared_by_the_optimisers_steps_where_their_intervals_a
     assert f"{expected} as much as one in position, the next." in said and "all absolute traces" not in said
     tiles = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
     assert tiles["the change of the loss by a step of the optimiser: log scale over position"] == f"{factor:.2g} : 1"
+    whole = data["traces"]["log_scales"]
+    data["traces"]["log_scales"] = whole | {"views_error": None}  # one of several views was measured
+    assert "optimiser" not in sentences(data)
+    width = 1e3 * whole["value"]  # not even the sign is known
+    data["traces"]["log_scales"] = whole | {"value": 0.0, "low": -width, "high": width, "sign": "undetermined"}
+    assert "optimiser" not in sentences(data)
+    data["traces"]["log_scales"] = whole
     data["steps"]["log_scales"] = 7e-3  # the same change as of positions, within the errors
     assert "optimiser" not in sentences(data) and "all absolute traces" in sentences(data)
 
@@ -306,6 +314,18 @@ def test_most_is_over_half_and_what_the_error_does_not_separate_is_named():
     said = sentences(data)
     assert "Position carries the largest part of the curvature" in said and "carries most" not in said
     assert "does not separate it from rotation and colour (SH)." in said
+
+
+def test_attributes_have_no_order_where_an_error_is_not_known():
+    """That by the views left out is not, where one of several was measured."""
+    data, _ = synthetic()
+    line = summary(probe_of(data), Path())[2]
+    assert line.startswith("traces  position") and " > " in line
+    for trace in data["traces"].values():
+        trace["views_error"] = None
+    line = summary(probe_of(data), Path())[2]
+    assert " > " not in line and line.count(" ≈ ") == len(data["traces"]) - 1
+    assert "Its error does not separate it from" in sentences(data)
 
 
 @pytest.mark.parametrize(

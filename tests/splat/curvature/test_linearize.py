@@ -13,7 +13,7 @@ from splat.curvature.linearize import LinearizedView
 from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings, photometric_loss
 from splat.model.gaussians import Gaussians
-from splat.model.settings import SMOOTH, Antialias, RenderSettings
+from splat.model.settings import Antialias, RenderSettings
 from splat.render.render import render
 from splat.scenes.view import View
 from tests.oracles import central_difference
@@ -31,6 +31,7 @@ from tests.splat.random_scenes import (
     random_like,
     relative_error,
 )
+from tests.splat.tiny import SMOOTH
 
 LOSSES = [
     LossSettings(),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from splat.model.settings import SMOOTH, RenderSettings
+from splat.model.settings import RenderSettings
 
 
 def test_defaults_are_those_of_the_original_rasterizer():
@@ -15,10 +15,6 @@ def test_defaults_are_those_of_the_original_rasterizer():
 def test_a_pixel_in_float32_stops_at_the_threshold_itself():
     """What a training comes to depends on every bit of it."""
     assert RenderSettings().floor(torch.float32) == 1e-4 < RenderSettings().floor(torch.float64)
-
-
-def test_smooth_switches_off_every_threshold_that_can_be():
-    assert SMOOTH.alpha_min == SMOOTH.transmittance_min == 0 and SMOOTH.contour_sigma is None
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splat.model.settings import SMOOTH, RenderSettings
+from splat.model.settings import RenderSettings
 from splat.projection.dispatch import coefficients_of, plain_gradient
 from splat.projection.reference import Splats, project
 from splat.raster.cpu.raster import CpuRaster
 from splat.raster.dispatch import Adjoint, Raster, Tangent
 from splat.raster.reference import rasterize_reference
 from tests.splat.random_scenes import random_camera, random_gaussians, random_like
+from tests.splat.tiny import SMOOTH
 
 BLOCKS = {"means": slice(0, 2), "conics": slice(2, 5), "opacities": slice(5, 6), "colours": slice(6, 9)}
 DIRECTIONS = 4

@@ -9,7 +9,7 @@ from torch import Tensor
 from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
-from splat.model.settings import SMOOTH, RenderSettings
+from splat.model.settings import RenderSettings
 from splat.render.forward import rasterize_view
 from splat.render.render import Backend, render, render_depth
 from tests.splat.held_scenes import BACKGROUND
@@ -22,6 +22,7 @@ from tests.splat.random_scenes import (
     random_like,
     relative_error,
 )
+from tests.splat.tiny import SMOOTH
 
 SIZES = [(48, 40), (1, 40), (40, 1), (7, 9)]
 

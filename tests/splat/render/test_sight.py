@@ -6,10 +6,11 @@ from torch import Tensor
 
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
-from splat.model.settings import SMOOTH, RenderSettings
+from splat.model.settings import RenderSettings
 from splat.projection.reference import project
 from splat.render.sight import sight
 from tests.splat.random_scenes import random_camera, random_gaussians
+from tests.splat.tiny import SMOOTH
 
 
 def weights(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> tuple[Tensor, list[int]]:

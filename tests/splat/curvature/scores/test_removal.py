@@ -8,10 +8,10 @@ from scipy.linalg import null_space
 from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.removal import SCORES, removal_errors, removal_scores
 from splat.losses.reference import LossSettings
-from splat.model.settings import SMOOTH
 from splat.scenes.view import View
 from tests.splat.held_scenes import BACKGROUND, mean_loss, two_views
 from tests.splat.random_scenes import random_camera, random_gaussians
+from tests.splat.tiny import SMOOTH
 
 L2 = LossSettings("l2", ssim_weight=0)
 
