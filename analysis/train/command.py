@@ -169,8 +169,8 @@ def _run(run: Run, options: TrainOptions, command: Sequence[str], along: Traject
     first = begins(run.scene, run.views, len(run.held_out), training, options.from_ or run.reference.start)
     say(first, console=console)
     begun = None if options.resume or options.from_ else (run.reference.start, len(training.gaussians))
-    found = remarks(run.scene, _asked(options, run.scene), _config(options, run.scene), begun)
-    say(*found, style="yellow", console=console)
+    settings = _asked(options, run.scene), _config(options, run.scene)
+    say(*remarks(run.scene, *settings, begun, training, run.views[0]), style="yellow", console=console)
     trajectory = None if along is None else Trajectory(run.out, training, run.views, along)
     if code := _follow(run, options, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])

@@ -13,6 +13,9 @@ from splat.training.state import TrainConfig, Training
 
 FEW = 500  # Gaussians at the start; density control adds others near those that are there, so that places without stay empty
 NAMED = 12  # views in the first line
+NARROW = (
+    0.02  # of an image's width: sigma of the smallest Gaussians that are removed for their size, below which it is said
+)
 HOW_IT_STARTS: dict[Source, str] = {
     "points": "the scene's points",
     "triangulated": "points triangulated in the training views",
@@ -29,12 +32,41 @@ HOW_TO_START: dict[Source, str] = {
 }
 
 
-def remarks(scene: Scene, asked: TrainConfig, config: TrainConfig, begun: tuple[Source, int] | None) -> list[str]:
+def remarks(
+    scene: Scene,
+    asked: TrainConfig,
+    config: TrainConfig,
+    begun: tuple[Source, int] | None,
+    training: Training,
+    view: View,
+) -> list[str]:
     """asked, config: the settings, not scaled and scaled, without what a checkpoint brings; begun: the start and its Gaussians,
-    None where there is a checkpoint."""
+    None where there is a checkpoint; view: one of those to train on."""
     found = [_skipped(scene), begun and poor_start(scene, *begun), _scaled(asked, config), _not_reached(config)]
-    found += _of_second_order(config)
+    found += [*_of_second_order(config), removes_for_size(training, view)]
     return [words for words in found if words]
+
+
+def removes_for_size(training: Training, view: View) -> str:
+    """Warning that 3DGS's rule removes Gaussians that are small in the image; empty where it does not.
+
+    The rule's unit is the radius of the training cameras, which is little where they are few or stand close together.
+    """
+    config, camera = training.config, view.camera
+    schedule, steps = config.method.density_control(config), range(training.step + 1, config.iterations + 1)
+    rounds = [n for n in steps if schedule.densifies(n, config.iterations) and schedule.prunes_large(n)]
+    if schedule.prune_scale is None or not rounds or isinstance(config.method, SecondOrder):
+        return ""
+    largest = schedule.prune_scale * training.extent
+    offsets = training.gaussians.means.detach().double().cpu() - camera.centre
+    pixels = largest * camera.fx / max(float((offsets @ camera.forward).median()), largest)
+    if pixels > NARROW * camera.width:
+        return ""
+    return (
+        f"3DGS's rule for scenes seen from all around removes all Gaussians with a sigma above {largest:.3g}, here some "
+        f"{pixels:.2g} px, in each round from step {rounds[0]:,} to {rounds[-1]:,}: the loss is high until then; "
+        "--set densify.prune_scale=none keeps them"
+    )
 
 
 def begins(scene: Scene, views: Sequence[View], held_out: int, training: Training, source: Source | Path) -> str:

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import get_args
@@ -14,10 +15,18 @@ from PIL import Image
 from torch import Tensor
 
 from analysis.commands.cli import main
+from analysis.console.overrides import overridden
 from analysis.records.records import read_record
 from analysis.train.command import planned
 from analysis.train.options import TrainOptions
-from analysis.train.remarks import HOW_IT_STARTS, HOW_TO_START, _not_reached, _of_second_order, poor_start
+from analysis.train.remarks import (
+    HOW_IT_STARTS,
+    HOW_TO_START,
+    _not_reached,
+    _of_second_order,
+    poor_start,
+    removes_for_size,
+)
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -28,7 +37,8 @@ from splat.training.methods.corgs import CoRGS
 from splat.training.methods.second_order.gn_cg import GaussNewtonCG
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.start import Source
-from splat.training.state import TrainConfig
+from splat.training.state import TrainConfig, Training
+from tests.splat.tiny import tiny_gaussians, tiny_views
 
 SIZE = (24, 18)
 
@@ -95,6 +105,26 @@ def test_frames_without_an_image_and_a_poor_start_are_said(original, tmp_path, c
     assert set(HOW_IT_STARTS) == set(HOW_TO_START) == set(sources) - {"scene"}
     assert train(scene, tmp_path / "run", "--iterations", "2", "--resume") == 2  # the same scene, but other settings
     assert "iterations = 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("extent", "changes", "said"),
+    [
+        (0.1, {}, "above 0.01, here some 0.1 px, in each round from step 3,100 to 4,900"),
+        (0.1, {"densify.prune_scale": "none"}, ""),
+        (0.1, {"densify.reset_every": "5000"}, ""),
+        (0.1, {"iterations": "6000"}, ""),  # density control ends with step 2,999
+        (30.0, {}, ""),
+    ],
+    ids=str,
+)
+def test_a_rule_that_removes_what_is_small_in_the_image_is_said(extent, changes, said):
+    config = overridden(TrainConfig(iterations=10000), changes)
+    gaussians, (view, *_) = tiny_gaussians(), tiny_views()
+    gaussians.means[:] = view.camera.centre + 3.0 * view.camera.forward
+    near = replace(view, camera=replace(view.camera, fx=30.0))
+    found = removes_for_size(Training.start(gaussians, extent, config), near)
+    assert said in found and bool(found) == bool(said)
 
 
 def test_without_lpips_the_metric_is_left_out_in_one_sentence_and_null_in_the_record(
