@@ -10,6 +10,7 @@ compare_sections    the loss along each of these directions, as far as each slic
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +27,9 @@ from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.run_files import COMPARISON, read_comparison
 from analysis.records.schema import Trace
 from figures.plane import Plane, plane, same_scale
+from figures.scripts import folder_script
 from figures.slice2d import RENDERED
-from figures.style import (
-    BLACK,
-    COLUMN,
-    FIELD_MAP,
-    MISSING,
-    RUNS,
-    VERMILION,
-    folder_script,
-    literal,
-    new_figure,
-    save,
-    style,
-)
+from figures.style import BLACK, COLUMN, FIELD_MAP, MISSING, RUNS, VERMILION, literal, new_figure, save, style
 from landscape.errors import InputError
 
 Records = Mapping[str, Record[ProbeRecord]]
@@ -250,10 +240,5 @@ def draw_comparison(folder: Path, suffix: str = "png") -> list[Path]:
     return [save(draw(records), folder / f"{name}.{suffix}") for name, draw in FIGURES.items() if known.get(name, True)]
 
 
-def main() -> None:
-    """`python -m figures.compare OUT [--format pdf]`"""
-    folder_script(draw_comparison, "the figures of a comparison", "compare")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(folder_script, draw_comparison, "the figures of a comparison", "compare"))

@@ -18,7 +18,8 @@ from matplotlib.ticker import NullLocator
 from analysis.console.failures import program
 from analysis.records.quantities import exponent_of, power_of_ten, quantity, unit_suffix
 from analysis.records.records import ProbeRecord, Record
-from figures.style import BLUE, VERMILION, new_figure, script, style
+from figures.scripts import script
+from figures.style import BLUE, VERMILION, new_figure, style
 from landscape.errors import InputError
 
 BROADENING = 0.01

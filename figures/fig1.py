@@ -18,9 +18,10 @@ from matplotlib.lines import Line2D
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.run_files import METRICS, read_scores
-from figures.fig7 import command_line, names_of, read_all
+from figures.fig7 import names_of, read_all
 from figures.manifold import Scale, contours, landscape_of, require_same_function, section, surface
 from figures.plane import Plane
+from figures.scripts import runs_script
 from figures.style import BLACK, RUNS, literal, new_figure, style
 from landscape.errors import InputError
 
@@ -109,10 +110,5 @@ def _views(run: Path) -> set[str]:
     return views
 
 
-def main() -> None:
-    """`python -m figures.fig1 RUN_3DGS RUN_STABLEGS`"""
-    command_line(draw, "fig1")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(runs_script, draw, "fig1"))

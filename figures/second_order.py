@@ -11,7 +11,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from analysis.console.failures import program
-from figures.style import RUNS, folder_script, literal, new_figure, save, style
+from figures.scripts import folder_script
+from figures.style import RUNS, literal, new_figure, save, style
 from landscape.errors import InputError
 
 ACROSS = {"cpu": "seconds of one processor", "passes": "passes over the pixels of a view"}

@@ -8,6 +8,7 @@ Grey: round-off hides the value; a triangle: it lies beyond the axis; hollow: an
 checkpoint, so that the difference holds kinks and jumps of the loss too.  The line is the infinitesimal curvature.
 """
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,9 @@ from analysis.records.quantities import exponent_of, quantity, unit_suffix
 from analysis.records.records import Record
 from analysis.records.schema import FiniteProbe, Slice
 from figures.plane import Direction, direction
+from figures.scripts import script
 from figures.slice2d import CROSSED, RENDERED
-from figures.style import BLACK, BLUE, VERMILION, new_figure, script, style
+from figures.style import BLACK, BLUE, VERMILION, new_figure, style
 from landscape.errors import InputError
 
 DOT = {"markersize": 5}
@@ -121,10 +123,5 @@ def _limits(exact: float, values: np.ndarray, bounds: np.ndarray) -> tuple[float
     return low - margin, high + margin
 
 
-def main() -> None:
-    """`python -m figures.slice1d RUN/slice-gradient-1d`"""
-    script(draw, "slice1d")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(script, draw, "slice1d"))

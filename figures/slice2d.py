@@ -9,6 +9,7 @@ the others, the cross-sections are drawn alone, and a sentence says what resolve
 """
 
 import textwrap
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,8 @@ from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
 from figures.plane import Direction, Plane, curvature_text, plane, same_scale
-from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
+from figures.scripts import script
+from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, style
 
 LEVELS = 12
 WRAP = 76  # characters in a line of the sentence
@@ -148,10 +150,5 @@ def _legend(field: Plane) -> list[Line2D]:
     return handles
 
 
-def main() -> None:
-    """`python -m figures.slice2d RUN/probe`"""
-    script(draw, "slice2d")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(script, draw, "slice2d"))

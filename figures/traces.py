@@ -9,6 +9,7 @@ diamond: the interval does not decide it).  An arrow at the left edge is a zero,
 """
 
 import math
+from functools import partial
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -23,7 +24,8 @@ from analysis.records.findings import attribute_name, largest_steps, shares_per_
 from analysis.records.quantities import measured, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from analysis.records.schema import Trace
-from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, script, style
+from figures.scripts import script
+from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, style
 
 SIGNS: dict[str, dict[str, Any]] = {
     "positive": {"color": POSITIVE, "marker": "o", "markerfacecolor": POSITIVE},
@@ -138,10 +140,5 @@ def _legend(entries: dict[str, Trace]) -> list[Line2D]:
     return [Line2D([], [], linestyle="none", label=sign, **look) for sign, look in SIGNS.items() if sign in present]
 
 
-def main() -> None:
-    """`python -m figures.traces RUN/probe`"""
-    script(draw, "traces", ProbeRecord)
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(script, draw, "traces", ProbeRecord))
