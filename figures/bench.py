@@ -57,7 +57,8 @@ def _panel(axes: Axes, lines: pd.DataFrame, study: str) -> None:
     gradient = pd.DataFrame(lines[lines["stage"] == "gradient"]).sort_values(by=study)
     values, times = gradient[study].to_numpy(float), gradient["minimum_ms"].to_numpy()
     slope = -1 if study == "threads" else 1
-    axes.plot(values, times[-1] * (values / values[-1]) ** slope, color="0.75", linewidth=0.8, zorder=0)
+    proportional = times[-1] * (values / values[-1]) ** slope
+    axes.plot(values, proportional, color="0.75", linewidth=0.8, zorder=0, label="in proportion")
     axes.set_xticks(values, [short(value) for value in values])
     axes.xaxis.set_minor_locator(NullLocator())
 
