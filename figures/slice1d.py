@@ -73,14 +73,11 @@ def _draw_loss(axes: Axes, along: Direction, about: Slice, arrays: dict[str, np.
     axes.set_ylabel(f"change of loss{unit_suffix(exponent)}")
     axes.grid(True)
     axes.set_title("Loss along a line through the checkpoint", loc="left")
-    step = along.unit / 10.0**along.exponent
     if about.directions[0].kind == "line":
         axes.axvline(1, color="0.7", linewidth=0.5, zorder=0)
         axes.secondary_xaxis("top").set_xticks([0, 1], ["this checkpoint", "the other"])
-    elif np.isfinite(step) and step > 0:
-        upper = axes.secondary_xaxis("top", functions=(lambda x: np.divide(x, step), lambda u: np.multiply(u, step)))
-        upper.xaxis.set_major_locator(MaxNLocator(7))
-        upper.set_xlabel("steps in curvature units")
+    else:
+        along.count_units(axes, 7, "steps in curvature units")
 
 
 def _draw_curvatures(axes: Axes, along: Direction, probe: FiniteProbe) -> None:

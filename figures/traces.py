@@ -43,7 +43,7 @@ def draw(record: Record[ProbeRecord]) -> Figure:
     with style():
         figure = new_figure(0.95 + 0.31 * len(entries))
         axes = figure.subplots()
-        _rows(axes, entries, [_signed(entry) for entry in entries.values()])
+        _rows(axes, entries)
         if shares:
             _draw_traces(axes, {name: scaled(entry, shares[name]) for name, entry in entries.items()},
                          {name: shares[name] * np.asarray(found) for name, found in samples.items()})  # fmt: skip
@@ -94,10 +94,9 @@ def _draw_traces(axes: Axes, entries: dict[str, Trace], samples: dict[str, np.nd
         axes.plot([value], [row], linestyle="none", **look)
 
 
-def _rows(axes: Axes, entries: dict[str, Trace], numbers: list[str]) -> None:
-    axes.set_yticks(
-        range(len(entries)), [f"{literal(attribute_name(k))}\n{n}" for k, n in zip(entries, numbers, strict=True)]
-    )
+def _rows(axes: Axes, entries: dict[str, Trace]) -> None:
+    numbers = {name: measured(entry.value, entry.standard_error) for name, entry in entries.items()}
+    axes.set_yticks(range(len(entries)), [f"{literal(attribute_name(k))}\n{n}" for k, n in numbers.items()])
     axes.set_ylim(len(entries) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
     axes.grid(True, axis="both")
@@ -123,10 +122,6 @@ def _arrow(axes: Axes, left: float, row: int, look: dict[str, Any]) -> None:
 
 def _sign(trace: Trace) -> str:
     return "undetermined" if trace.value is None or math.isnan(trace.value) else trace.sign
-
-
-def _signed(trace: Trace) -> str:
-    return measured(trace.value, trace.standard_error)
 
 
 def _drawable(number: float | None) -> TypeGuard[float]:
