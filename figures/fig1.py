@@ -42,8 +42,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     view = min(common)
     scale = Scale.of(*landscapes)
     with style():
-        figure = new_figure(7.4)
-        figure.set_figwidth(WIDTH)
+        figure = new_figure(7.4, WIDTH)
         above, below = figure.subfigures(2, 1, height_ratios=[3.6, 1], squeeze=False)[:, 0]
         maps = [above.add_subplot(3, 2, 3 + i) for i in range(len(runs))]
         photograph = _photograph(runs[0], view)

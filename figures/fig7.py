@@ -41,8 +41,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     scale, wide = Scale.of(*ends), Scale.of(start)
     across = scale.holding(start)
     with style():
-        figure = new_figure(4.4)
-        figure.set_figwidth(PAGE)
+        figure = new_figure(4.4, PAGE)
         index = figure.add_subplot(2, 3, 1)
         index_over_steps(index, measured, dict(zip(names, RUNS, strict=False)), "literal")
         index.set(xlabel="step", ylabel="|λmax / λmin|", title="Anisotropy index")

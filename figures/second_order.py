@@ -23,8 +23,7 @@ PAGE = 6.9
 def draw_scene(table: pd.DataFrame) -> Figure:
     """table: the rows of one scene."""
     with style():
-        figure = new_figure(4.2)
-        figure.set_figwidth(PAGE)
+        figure = new_figure(4.2, PAGE)
         panels = figure.subplots(2, 2, sharex="col", sharey="row")
         for colour, (name, rows) in zip(RUNS, table.groupby("method", sort=False), strict=False):
             by_step = rows.groupby("step")

@@ -24,12 +24,11 @@ SUFFIXES = ("png", "pdf", "svg")
 FIELD_MAP = "cividis"
 MISSING = "0.85"  # grey of points without a value
 
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
+BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (
     "#000000",
     "#E69F00",
     "#56B4E9",
     "#009E73",
-    "#F0E442",
     "#0072B2",
     "#D55E00",
     "#CC79A7",
