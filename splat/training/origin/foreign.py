@@ -19,7 +19,7 @@ import torch
 
 from landscape.errors import InputError
 from splat.losses.reference import LossSettings, psnr
-from splat.model.files.read import read_splats
+from splat.model.files.read import model_folder, read_splats
 from splat.model.files.splat_file import SplatFile
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -142,11 +142,7 @@ def _split(scene: Scene, found: SplatFile, ask: Foreign, path: Path) -> tuple[Sp
 
 def _used(path: Path, scene: Scene) -> set[str]:
     """Names of the scene's images that graphdeco's `cameras.json` lists; empty where there is none, or one of another scene."""
-    file = (
-        path.resolve().parents[2] / "cameras.json"
-        if "point_cloud" in path.resolve().parts[-3:]
-        else path.parent / "cameras.json"
-    )
+    file = model_folder(path) / "cameras.json"
     if not file.is_file():
         return set()
     try:
