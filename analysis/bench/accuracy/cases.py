@@ -148,9 +148,9 @@ def _product(operator: SymmetricOperator, V: Tensor) -> Tensor:
 # --- random matrices --------------------------------------------------------------------------------------------------
 
 
-def spectra(n: int = ROWS) -> dict[str, Float64[Tensor, " n"]]:
+def spectra() -> dict[str, Float64[Tensor, " n"]]:
     """Spectra like those of curvature: a power law, clusters at the ends, both signs, few nonzero ones, none dominant."""
-    i = torch.arange(n, dtype=torch.float64)
+    n, i = ROWS, torch.arange(ROWS, dtype=torch.float64)
     ends = torch.where(i < 5, 1 - 1e-3 * i, torch.where(i >= n - 4, -0.3, 0.3 * i / n))
     return {
         "power law": (1 + i) ** -1.5,
