@@ -17,7 +17,7 @@ from msgspec import UNSET
 
 from analysis.records import schema
 from analysis.records.findings import unresolved
-from analysis.records.quantities import exponent_of, quantity, unit_suffix
+from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import Record
 from figures.style import literal
 from landscape.errors import InputError
@@ -156,8 +156,3 @@ def _alike(arrays: dict[str, np.ndarray]) -> bool:
 def same_scale(x: float, y: float) -> bool:
     """Whether two ranges are drawn to the same scale."""
     return 1 / TRUE_PROPORTIONS < x / y < TRUE_PROPORTIONS
-
-
-def curvature_text(direction: Direction) -> str:
-    """`e₁: curvature 3.1 × 10⁴`."""
-    return f"{direction.name}: curvature {quantity(direction.curvature)}"

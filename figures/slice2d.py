@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
-from figures.plane import Direction, Plane, curvature_text, plane, same_scale
+from figures.plane import Direction, Plane, plane, same_scale
 from figures.scripts import script
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, style
 
@@ -123,7 +123,7 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
     axes.xaxis.set_major_locator(MaxNLocator(INTERVALS))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.grid(True)
-    label = f"{curvature_text(direction)}\nsteps in curvature units"
+    label = f"{direction.name}: curvature {quantity(direction.curvature)}\nsteps in curvature units"
     direction.count_units(axes, INTERVALS, label, linespacing=1.4)
 
 
