@@ -4,8 +4,8 @@
 method; down and to the left is better.  The star is the library's default.
 """
 
-import argparse
-import sys
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from analysis.console.failures import program
-from figures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, literal, new_figure, save, style
+from figures.scripts import table_script
+from figures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, literal, new_figure, style
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, "0.45", BLACK, "saddlebrown", "olive")
 LINES = {"own": ("-", "o"), "peer": ("--", "^")}
@@ -76,22 +77,14 @@ def _panel(axes: Axes, part: pd.DataFrame, looks: dict[tuple[str, str], tuple[st
     )
 
 
-def main() -> None:
-    """`python -m figures.accuracy BENCH/accuracy_points.csv`"""
-    parser = argparse.ArgumentParser(description="Draw error against work as recorded by `landscape bench accuracy`.")
-    parser.add_argument("table", type=Path, help="accuracy_points.csv, as written by `landscape bench accuracy`")
-    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
-    arguments = parser.parse_args()
-    try:
-        table = pd.read_csv(arguments.table)
-        for quantity in table["quantity"].unique():
-            name = f"accuracy_{''.join(c if c.isalpha() else '_' for c in quantity).strip('_')}.{arguments.format}"
-            print(save(draw(table, quantity), arguments.table.with_name(name)))
-    except (FileNotFoundError, ValueError, KeyError, IndexError) as error:
-        message = f"expected accuracy_points.csv as written by landscape bench accuracy, got {arguments.table}: {error}"
-        print(message, file=sys.stderr)
-        sys.exit(2)
+def draw_all(path: Path) -> Iterator[tuple[str, Figure]]:
+    """A figure for each quantity of accuracy_points.csv, and the name of its file."""
+    table = pd.read_csv(path)
+    for quantity in table["quantity"].unique():
+        words = "".join(c if c.isalpha() else "_" for c in quantity).strip("_")
+        yield f"accuracy_{words}", draw(table, quantity)
 
 
 if __name__ == "__main__":
-    program(main)
+    what = "error against work as recorded by `landscape bench accuracy`"
+    program(partial(table_script, draw_all, what, "accuracy_points.csv", "bench accuracy"))

@@ -3,8 +3,7 @@
 `python -m figures.bench BENCH/bench.csv` draws it beside the table.  The grey lines have slope 1 (threads: slope -1).
 """
 
-import argparse
-import sys
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -13,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from analysis.console.failures import program
-from figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, new_figure, save, style
+from figures.scripts import table_script
+from figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, literal, new_figure, style
 
 LABELS = {"gaussians": "Gaussians", "pixels": "pixels", "views": "views", "threads": "threads"}
 LOOKS = {
@@ -39,7 +39,7 @@ def draw(table: pd.DataFrame) -> Figure:
         for axes in panels[:, 0]:
             axes.set_ylabel("time (ms)")
         scene = str(table.loc[table["study"] == "gaussians", "scene"].iloc[0])
-        figure.suptitle(scene.replace("$", r"\$"), fontsize=7.5)
+        figure.suptitle(literal(scene), fontsize=7.5)
         handles, labels = panels[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3, handletextpad=0.3, columnspacing=1)
     return figure
@@ -57,7 +57,8 @@ def _panel(axes: Axes, lines: pd.DataFrame, study: str) -> None:
     gradient = pd.DataFrame(lines[lines["stage"] == "gradient"]).sort_values(by=study)
     values, times = gradient[study].to_numpy(float), gradient["minimum_ms"].to_numpy()
     slope = -1 if study == "threads" else 1
-    axes.plot(values, times[-1] * (values / values[-1]) ** slope, color="0.75", linewidth=0.8, zorder=0)
+    proportional = times[-1] * (values / values[-1]) ** slope
+    axes.plot(values, proportional, color="0.75", linewidth=0.8, zorder=0, label="in proportion")
     axes.set_xticks(values, [short(value) for value in values])
     axes.xaxis.set_minor_locator(NullLocator())
 
@@ -74,19 +75,11 @@ def short(count: float) -> str:
     return f"{thousands:.1f}k" if thousands < 9.95 else f"{thousands:.0f}k"
 
 
-def main() -> None:
-    """`python -m figures.bench BENCH/bench.csv`"""
-    parser = argparse.ArgumentParser(description="Draw the scaling recorded by `landscape bench` beside its table.")
-    parser.add_argument("table", type=Path, help="bench.csv, as written by `landscape bench`")
-    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
-    arguments = parser.parse_args()
-    try:
-        path = save(draw(pd.read_csv(arguments.table)), arguments.table.with_suffix(f".{arguments.format}"))
-    except (FileNotFoundError, ValueError, KeyError, IndexError) as error:
-        print(f"expected bench.csv as written by landscape bench, got {arguments.table}: {error}", file=sys.stderr)
-        sys.exit(2)
-    print(path)
+def draw_named(path: Path) -> list[tuple[str, Figure]]:
+    """The figure of a bench.csv, named as that is."""
+    return [(path.stem, draw(pd.read_csv(path)))]
 
 
 if __name__ == "__main__":
-    program(main)
+    what = "the scaling recorded by `landscape bench` beside its table"
+    program(partial(table_script, draw_named, what, "bench.csv", "bench"))

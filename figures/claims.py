@@ -16,7 +16,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from analysis.console.failures import program
 from analysis.records.findings import attribute_name
-from figures.style import BLUE, UNDETERMINED, VERMILION, folder_script, new_figure, save, style
+from figures.scripts import folder_script
+from figures.style import BLUE, UNDETERMINED, VERMILION, new_figure, save, style
 
 UNITS = {"×": "ratio (×)", "dB": "PSNR gained (dB)", "": "share or correlation"}
 KINDS = {"all": "all runs", "between": "means of methods", "within": "seeds of a method"}

@@ -10,6 +10,7 @@ compare_sections    the loss along each of these directions, as far as each slic
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +27,9 @@ from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.run_files import COMPARISON, read_comparison
 from analysis.records.schema import Trace
 from figures.plane import Plane, plane, same_scale
+from figures.scripts import folder_script
 from figures.slice2d import RENDERED
-from figures.style import (
-    BLACK,
-    COLUMN,
-    FIELD_MAP,
-    MISSING,
-    RUNS,
-    VERMILION,
-    folder_script,
-    literal,
-    new_figure,
-    save,
-    style,
-)
+from figures.style import BLACK, COLUMN, FIELD_MAP, MISSING, RUNS, VERMILION, literal, new_figure, save, style
 from landscape.errors import InputError
 
 Records = Mapping[str, Record[ProbeRecord]]
@@ -142,9 +132,8 @@ def draw_slices(records: Records) -> Figure:
     planes = {label: plane(record) for label, record in records.items() if _has_surface(record)}
     reach = [min(float(np.abs(getattr(field, axis).steps).max()) for field in planes.values()) for axis in "xy"]
     exponent = exponent_of(*reach)
-    windows = {label: _window(field, *reach) for label, field in planes.items()}
-    high = max(float(change[mask].max()) for _, _, change, mask in windows.values())
-    low = min(float(change[mask].min()) for _, _, change, mask in windows.values())
+    shown = np.concatenate([_within(field, *reach) for field in planes.values()])
+    low, high = float(shown.min()), float(shown.max())
     power = exponent_of(high, low)
     levels = MaxNLocator(LEVELS).tick_values(low / 10.0**power, high / 10.0**power)
     rows, columns = -(-len(planes) // ACROSS), min(len(planes), ACROSS)
@@ -154,10 +143,9 @@ def draw_slices(records: Records) -> Figure:
         figure = new_figure(0.4 + (0.3 + min(WIDTH / columns * shape, TALLEST)) * rows, 2 * COLUMN)
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         filled = None
-        for axes, (label, (x, y, change, _)), field in zip(
-            panels.ravel(), windows.items(), planes.values(), strict=False
-        ):
-            values, steps = change.T / 10.0**power, (x / 10.0**exponent, y / 10.0**exponent)
+        for axes, (label, field) in zip(panels.ravel(), planes.items(), strict=False):
+            values = field.rise.T / 10.0**power
+            steps = field.x.steps / 10.0**exponent, field.y.steps / 10.0**exponent
             axes.set_facecolor(MISSING)
             filled = axes.contourf(*steps, values, levels=levels, cmap=FIELD_MAP, extend="both")
             axes.contour(*steps, values, levels=levels, colors=BLACK, linewidths=0.4)
@@ -183,18 +171,16 @@ def _has_surface(record: Record[ProbeRecord]) -> bool:
     return "slice" in record.arrays and about is not None and about.is_resolved
 
 
-def _window(field: Plane, x: float, y: float) -> tuple[np.ndarray, np.ndarray, np.ma.MaskedArray, np.ndarray]:
-    """Steps, the change of loss, and which of its points lie within the window (and are finite)."""
+def _within(field: Plane, x: float, y: float) -> np.ndarray:
+    """The changes of the loss at the points of the window that are finite."""
     inside = np.outer(np.abs(field.x.steps) <= x * (1 + 1e-9), np.abs(field.y.steps) <= y * (1 + 1e-9))
-    change = field.change * 10.0**field.exponent
-    return field.x.steps, field.y.steps, change, inside & ~np.ma.getmaskarray(change)
+    return field.rise[inside].compressed()
 
 
 def draw_sections(records: Records) -> Figure:
     """The lines through the centres of the planes, as far as each goes."""
     planes = {label: plane(record) if "slice" in record.arrays else None for label, record in records.items()}
-    changes = [field.change * 10.0**field.exponent for field in planes.values() if field is not None]
-    power = exponent_of(*(change.compressed() for change in changes))
+    power = exponent_of(*(field.rise.compressed() for field in planes.values() if field is not None))
     steps = exponent_of(*(axis.steps for field in planes.values() if field is not None for axis in (field.x, field.y)))
     with style():
         figure = new_figure(2.6, 2 * COLUMN)
@@ -203,8 +189,7 @@ def draw_sections(records: Records) -> Figure:
             if field is None:
                 continue
             for number, (axes, along) in enumerate(zip(panels, (field.x, field.y), strict=True)):
-                other = field.y if number == 0 else field.x
-                line = field.change.take(other.centre, axis=1 - number) * 10.0 ** (field.exponent - power)
+                line = field.through_centre(field.rise, number) / 10.0**power
                 axes.plot(along.steps / 10.0**steps, line, **look)
         for axes, which in zip(panels, ("steepest", "second"), strict=True):
             axes.set_xlabel(f"step, stored units{unit_suffix(steps)}")
@@ -250,10 +235,5 @@ def draw_comparison(folder: Path, suffix: str = "png") -> list[Path]:
     return [save(draw(records), folder / f"{name}.{suffix}") for name, draw in FIGURES.items() if known.get(name, True)]
 
 
-def main() -> None:
-    """`python -m figures.compare OUT [--format pdf]`"""
-    folder_script(draw_comparison, "the figures of a comparison", "compare")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(folder_script, draw_comparison, "the figures of a comparison", "compare"))

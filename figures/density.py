@@ -7,7 +7,7 @@ sigma = BROADENING of the range; a peak narrower than sigma is not resolved.
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,8 @@ from matplotlib.ticker import NullLocator
 from analysis.console.failures import program
 from analysis.records.quantities import exponent_of, power_of_ten, quantity, unit_suffix
 from analysis.records.records import ProbeRecord, Record
-from figures.style import BLUE, VERMILION, new_figure, script, style
+from figures.scripts import script
+from figures.style import BLUE, VERMILION, new_figure, style
 from landscape.errors import InputError
 
 BROADENING = 0.01
@@ -101,9 +102,9 @@ def draw(record: Record[ProbeRecord]) -> Figure:
     return draw_density(_OfRecord(arrays["nodes"], arrays["weights"]))
 
 
-class _OfRecord:
-    def __init__(self, nodes: np.ndarray, weights: np.ndarray):
-        self.nodes, self.weights = nodes, weights
+class _OfRecord(NamedTuple):
+    nodes: np.ndarray
+    weights: np.ndarray
 
 
 if __name__ == "__main__":

@@ -18,9 +18,10 @@ from matplotlib.lines import Line2D
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.run_files import METRICS, read_scores
-from figures.fig7 import command_line, names_of, read_all
+from figures.fig7 import names_of, read_all
 from figures.manifold import Scale, contours, landscape_of, require_same_function, section, surface
 from figures.plane import Plane
+from figures.scripts import runs_script
 from figures.style import BLACK, RUNS, literal, new_figure, style
 from landscape.errors import InputError
 
@@ -41,8 +42,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     view = min(common)
     scale = Scale.of(*landscapes)
     with style():
-        figure = new_figure(7.4)
-        figure.set_figwidth(WIDTH)
+        figure = new_figure(7.4, WIDTH)
         above, below = figure.subfigures(2, 1, height_ratios=[3.6, 1], squeeze=False)[:, 0]
         maps = [above.add_subplot(3, 2, 3 + i) for i in range(len(runs))]
         photograph = _photograph(runs[0], view)
@@ -109,10 +109,5 @@ def _views(run: Path) -> set[str]:
     return views
 
 
-def main() -> None:
-    """`python -m figures.fig1 RUN_3DGS RUN_STABLEGS`"""
-    command_line(draw, "fig1")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(runs_script, draw, "fig1"))

@@ -7,7 +7,6 @@ the start's surface, whose title says how much farther it reaches (a start may b
 sections' losses, which hold the start's too: a slope is not cut off where it falls below its centre.
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,8 @@ from matplotlib.figure import Figure
 from analysis.console.failures import program
 from analysis.records.run_files import RECORDS, read_trajectory
 from figures.manifold import Scale, landscape_of, require_same_function, section, start_of, surface
-from figures.style import BLUE, RUNS, literal, new_figure, save, style
+from figures.scripts import runs_script
+from figures.style import BLUE, RUNS, literal, new_figure, style
 from figures.trajectory import index_over_steps, marker_words, step_ticks
 from landscape.errors import InputError
 
@@ -41,8 +41,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     scale, wide = Scale.of(*ends), Scale.of(start)
     across = scale.holding(start)
     with style():
-        figure = new_figure(4.4)
-        figure.set_figwidth(PAGE)
+        figure = new_figure(4.4, PAGE)
         index = figure.add_subplot(2, 3, 1)
         index_over_steps(index, measured, dict(zip(names, RUNS, strict=False)), "literal")
         index.set(xlabel="step", ylabel="|λmax / λmin|", title="Anisotropy index")
@@ -79,7 +78,7 @@ def names_of(runs: Sequence[Path]) -> list[str]:
 
 
 def read_all(*reads: Callable[[], Any]) -> list[Any]:
-    """Results of all readers.  ValueError with everything that is missing or wrong at once."""
+    """Results of all readers.  ValueError with a line for everything that is missing or wrong."""
     found, missing = [], []
     for read in reads:
         try:
@@ -87,7 +86,7 @@ def read_all(*reads: Callable[[], Any]) -> list[Any]:
         except (FileNotFoundError, ValueError) as error:
             missing.append(str(error))
     if missing:
-        raise InputError("; and ".join(missing))
+        raise InputError("\n".join(missing))
     return found
 
 
@@ -102,21 +101,5 @@ def _measured(run: Path, name: str) -> pd.DataFrame:
     return table
 
 
-def main() -> None:
-    """`python -m figures.fig7 RUN_3DGS RUN_STABLEGS`"""
-    command_line(draw, "fig7")
-
-
-def command_line(figure, name: str) -> None:
-    """Draw a figure of two runs, named on the command line, into a file."""
-    parser = argparse.ArgumentParser(description=f"Draw {name} from the records of two runs.")
-    parser.add_argument(
-        "runs", type=Path, nargs=2, metavar="RUN", help="folders of landscape train: 3DGS, then StableGS"
-    )
-    parser.add_argument("--out", type=Path, default=Path(f"{name}.png"), help="PNG, PDF or SVG, by its suffix")
-    arguments = parser.parse_args()
-    print(save(figure(arguments.runs), arguments.out))
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(runs_script, draw, "fig7"))

@@ -11,7 +11,8 @@ from pathlib import Path
 from analysis.console.failures import program
 from analysis.records.records import ProbeRecord, Record, read_record
 from figures import slice1d, slice2d, spectrum, surface, traces
-from figures.style import folder_script, save
+from figures.scripts import folder_script
+from figures.style import save
 from landscape.errors import TooLittleMemory
 
 FIGURES = {
@@ -59,11 +60,12 @@ def _draw(record: Record, suffix: str, name: str) -> Path:
     return save(FIGURES[name](record), record.folder / f"{name}.{suffix}")
 
 
-def main() -> None:
+def main() -> int:
     """`python -m figures.make_all RUN/probe [--without surface]`"""
     options = argparse.ArgumentParser(add_help=False)
     options.add_argument("--without", choices=FIGURES, action="append", default=[], help="a figure to leave out")
-    folder_script(partial(draw_probe, processes=len(FIGURES)), "all figures of a recorded probe", "probe", [options])
+    draw = partial(draw_probe, processes=len(FIGURES))
+    return folder_script(draw, "all figures of a recorded probe", "probe", [options])
 
 
 if __name__ == "__main__":

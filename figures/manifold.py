@@ -47,9 +47,9 @@ class Scale:
 
     @classmethod
     def of(cls, *landscapes: Plane) -> "Scale":
-        changes = [change_of(each) for each in landscapes]
         reach = max(float(np.abs(d.steps).max()) for each in landscapes for d in (each.x, each.y))
-        low, high = min(float(c.min()) for c in changes), max(float(c.max()) for c in changes)
+        low = min(float(each.rise.min()) for each in landscapes)
+        high = max(float(each.rise.max()) for each in landscapes)
         return cls(reach, low, high if high > low else low + 1.0)
 
     @property
@@ -73,20 +73,13 @@ class Scale:
 
     def holding(self, other: Plane) -> "Scale":
         """Limits with the same steps that hold another landscape's sections too."""
-        lines = [through_centre(other, axis) for axis in (0, 1)]
-        near = np.ma.concatenate([change[np.abs(steps) <= self.reach] for steps, change in lines])
+        near = np.ma.concatenate(
+            [
+                other.through_centre(other.rise, axis)[np.abs(along.steps) <= self.reach]
+                for axis, along in enumerate((other.x, other.y))
+            ]
+        )
         return replace(self, low=min(self.low, float(near.min())), high=max(self.high, float(near.max())))
-
-
-def change_of(landscape: Plane) -> np.ma.MaskedArray:
-    """The loss minus that at the centre."""
-    return landscape.change * 10.0**landscape.exponent
-
-
-def through_centre(landscape: Plane, axis: int) -> tuple[np.ndarray, np.ma.MaskedArray]:
-    """Steps and change of the loss on the grid's line through the centre along the first (axis 0) or the second direction."""
-    along, other = (landscape.x, landscape.y) if axis == 0 else (landscape.y, landscape.x)
-    return along.steps, change_of(landscape).take(other.centre, axis=1 - axis)
 
 
 def require_same_function(runs: Sequence[Path]) -> None:
@@ -155,7 +148,7 @@ def surface(
     axes: Axes3D = figure.add_subplot(*place, projection="3d")  # pyright: ignore[reportAssignmentType]
     steps, loss = 10.0**scale.steps, 10.0**scale.loss
     x, y = np.meshgrid(landscape.x.steps / steps, landscape.y.steps / steps, indexing="ij")
-    height = change_of(landscape).filled(np.nan) / loss
+    height = landscape.rise.filled(np.nan) / loss
     low, high = scale.low / loss, scale.high / loss
     drawn = axes.plot_surface(x, y, height, cmap=FIELD_MAP, rcount=60, ccount=60, linewidth=0.1, vmin=low, vmax=high)
     reach = scale.reach / steps
@@ -188,7 +181,7 @@ def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
     """Landscape from above, at levels that all landscapes share."""
     steps, loss = 10.0**scale.steps, 10.0**scale.loss
     levels = np.asarray(MaxNLocator(LEVELS).tick_values(scale.low / loss, scale.high / loss))
-    x, y, change = landscape.x.steps / steps, landscape.y.steps / steps, change_of(landscape).T / loss
+    x, y, change = landscape.x.steps / steps, landscape.y.steps / steps, landscape.rise.T / loss
     axes.set_facecolor(MISSING)
     filled = axes.contourf(x, y, change, levels=levels, cmap=FIELD_MAP)
     axes.contour(x, y, change, levels=levels, colors=BLACK, linewidths=0.4)
@@ -203,8 +196,8 @@ def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
 
 def section(axes: Axes, landscape: Plane, scale: Scale, axis: int, **look: object) -> None:
     """The grid's line through the centre along the first (axis 0) or the second direction."""
-    steps, change = through_centre(landscape, axis)
-    axes.plot(steps / 10.0**scale.steps, change / 10.0**scale.loss, **look)  # pyright: ignore[reportArgumentType]
+    steps, rise = (landscape.x, landscape.y)[axis].steps, landscape.through_centre(landscape.rise, axis)
+    axes.plot(steps / 10.0**scale.steps, rise / 10.0**scale.loss, **look)  # pyright: ignore[reportArgumentType]
     reach, loss = scale.reach / 10.0**scale.steps, 10.0**scale.loss
     axes.set(xlim=(-reach, reach), ylim=(scale.low / loss, scale.high / loss))
     axes.xaxis.set_major_locator(MaxNLocator(4))

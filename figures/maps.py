@@ -27,7 +27,8 @@ from matplotlib.transforms import Affine2D, Bbox, TransformedBbox
 from analysis.console.failures import program
 from analysis.records.quantities import BYTES, Shade, percent, quantity
 from analysis.records.run_files import Carrier, MapRecord, Panel, Steepest, Swaps, read_map
-from figures.style import BLACK, BLUE, GREEN, VERMILION, folder_script, literal, save, style
+from figures.scripts import folder_script
+from figures.style import BLACK, BLUE, GREEN, VERMILION, literal, save, style
 
 BOUNDS = {"error": (0,), "one_view": (0, BYTES)}  # ends of a scale, in bytes, beyond which nothing is
 SAME = 0.02  # greatest difference of curves that look alike, of their axis
@@ -263,10 +264,5 @@ def _draw(folder: Path, suffix: str, record: MapRecord, job: tuple[str, str]) ->
     return save(figure, folder / f"{file.replace('view', kind)}.{suffix}", compression=2)
 
 
-def main() -> None:
-    """`python -m figures.maps RUN/map`"""
-    folder_script(draw_maps, "the maps of the training views", "map")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(folder_script, draw_maps, "the maps of the training views", "map"))

@@ -13,7 +13,6 @@ Each figure as PNG and PDF.  A cell of the study that was not run is named where
 """
 
 import argparse
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from analysis.runs.claims.effects import BASE, LEAST, SCORE, STABLE, Interval, g
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
 from figures.claims import draw_claims, draw_predictors, words_of
+from figures.scripts import print_files
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
 from splat.model.untrusted import replacing
 
@@ -289,14 +289,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("results", type=Path, nargs="?", default=RESULTS, help="folder with study.csv")
     parser.add_argument("--out", type=Path, default=Path("runs/paper"), help="folder of the figures")
     options = parser.parse_args(arguments)
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
-        for path in make(options.results, options.out):
-            print(path)
-    except (FileNotFoundError, ValueError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
+    options.out.mkdir(parents=True, exist_ok=True)
+    return print_files(lambda: make(options.results, options.out))
 
 
 if __name__ == "__main__":

@@ -8,13 +8,16 @@ crossed     a render whose order of splats or set of visible ones is not the cen
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 from msgspec import UNSET
 
 from analysis.records import schema
 from analysis.records.findings import unresolved
-from analysis.records.quantities import exponent_of, quantity, unit_suffix
+from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import Record
 from figures.style import literal
 from landscape.errors import InputError
@@ -51,6 +54,15 @@ class Direction:
         """The index of the step nearest to 0."""
         return int(np.argmin(np.abs(self.steps)))
 
+    def count_units(self, axes: Axes, ticks: int, label: str, **look: Any) -> None:
+        """An upper axis that counts steps in curvature units, where there is such a unit."""
+        step = self.unit / 10.0**self.exponent
+        if np.isfinite(step) and step > 0:
+            both = (lambda x: np.divide(x, step), lambda u: np.multiply(u, step))
+            upper = axes.secondary_xaxis("top", functions=both)
+            upper.xaxis.set_major_locator(MaxNLocator(ticks))
+            upper.set_xlabel(label, **look)
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -74,6 +86,16 @@ class Plane:
     @property
     def label(self) -> str:
         return f"change of loss{unit_suffix(self.exponent)}"
+
+    @property
+    def rise(self) -> np.ma.MaskedArray:
+        """The change in the loss's own unit."""
+        return self.change * 10.0**self.exponent
+
+    def through_centre(self, values: np.ndarray, axis: int) -> np.ndarray:
+        """Values [nx, ny] on the grid's line through the centre along the first (axis 0) or the second direction."""
+        other = self.y if axis == 0 else self.x
+        return values.take(other.centre, axis=1 - axis)
 
     @property
     def others(self) -> list[tuple[float, float]]:
@@ -134,8 +156,3 @@ def _alike(arrays: dict[str, np.ndarray]) -> bool:
 def same_scale(x: float, y: float) -> bool:
     """Whether two ranges are drawn to the same scale."""
     return 1 / TRUE_PROPORTIONS < x / y < TRUE_PROPORTIONS
-
-
-def curvature_text(direction: Direction) -> str:
-    """`e₁: curvature 3.1 × 10⁴`."""
-    return f"{direction.name}: curvature {quantity(direction.curvature)}"

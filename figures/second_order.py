@@ -11,7 +11,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from analysis.console.failures import program
-from figures.style import RUNS, folder_script, literal, new_figure, save, style
+from figures.scripts import folder_script
+from figures.style import RUNS, literal, new_figure, save, style
 from landscape.errors import InputError
 
 ACROSS = {"cpu": "seconds of one processor", "passes": "passes over the pixels of a view"}
@@ -22,8 +23,7 @@ PAGE = 6.9
 def draw_scene(table: pd.DataFrame) -> Figure:
     """table: the rows of one scene."""
     with style():
-        figure = new_figure(4.2)
-        figure.set_figwidth(PAGE)
+        figure = new_figure(4.2, PAGE)
         panels = figure.subplots(2, 2, sharex="col", sharey="row")
         for colour, (name, rows) in zip(RUNS, table.groupby("method", sort=False), strict=False):
             by_step = rows.groupby("step")

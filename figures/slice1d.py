@@ -8,6 +8,7 @@ Grey: round-off hides the value; a triangle: it lies beyond the axis; hollow: an
 checkpoint, so that the difference holds kinks and jumps of the loss too.  The line is the infinitesimal curvature.
 """
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,9 @@ from analysis.records.quantities import exponent_of, quantity, unit_suffix
 from analysis.records.records import Record
 from analysis.records.schema import FiniteProbe, Slice
 from figures.plane import Direction, direction
+from figures.scripts import script
 from figures.slice2d import CROSSED, RENDERED
-from figures.style import BLACK, BLUE, VERMILION, new_figure, script, style
+from figures.style import BLACK, BLUE, VERMILION, new_figure, style
 from landscape.errors import InputError
 
 DOT = {"markersize": 5}
@@ -71,14 +73,11 @@ def _draw_loss(axes: Axes, along: Direction, about: Slice, arrays: dict[str, np.
     axes.set_ylabel(f"change of loss{unit_suffix(exponent)}")
     axes.grid(True)
     axes.set_title("Loss along a line through the checkpoint", loc="left")
-    step = along.unit / 10.0**along.exponent
     if about.directions[0].kind == "line":
         axes.axvline(1, color="0.7", linewidth=0.5, zorder=0)
         axes.secondary_xaxis("top").set_xticks([0, 1], ["this checkpoint", "the other"])
-    elif np.isfinite(step) and step > 0:
-        upper = axes.secondary_xaxis("top", functions=(lambda x: np.divide(x, step), lambda u: np.multiply(u, step)))
-        upper.xaxis.set_major_locator(MaxNLocator(7))
-        upper.set_xlabel("steps in curvature units")
+    else:
+        along.count_units(axes, 7, "steps in curvature units")
 
 
 def _draw_curvatures(axes: Axes, along: Direction, probe: FiniteProbe) -> None:
@@ -121,10 +120,5 @@ def _limits(exact: float, values: np.ndarray, bounds: np.ndarray) -> tuple[float
     return low - margin, high + margin
 
 
-def main() -> None:
-    """`python -m figures.slice1d RUN/slice-gradient-1d`"""
-    script(draw, "slice1d")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(script, draw, "slice1d"))

@@ -9,6 +9,7 @@ the others, the cross-sections are drawn alone, and a sentence says what resolve
 """
 
 import textwrap
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,9 @@ from matplotlib.ticker import MaxNLocator
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
-from figures.plane import Direction, Plane, curvature_text, plane, same_scale
-from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
+from figures.plane import Direction, Plane, plane, same_scale
+from figures.scripts import script
+from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, style
 
 LEVELS = 12
 WRAP = 76  # characters in a line of the sentence
@@ -107,26 +109,22 @@ def _levels(field: Plane) -> np.ndarray:
 
 def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> None:
     """The grid's line through the centre along one direction."""
-    other = field.y if axis == 0 else field.x
-    line = field.change.take(other.centre, axis=1 - axis)
+    line = field.through_centre(field.change, axis)
     axes.plot(direction.scaled, line, color=BLACK)
     if not field.evaluated.all():
-        known = field.evaluated.take(other.centre, axis=1 - axis)
-        crossed = known & (False if field.crossed is None else field.crossed.take(other.centre, axis=1 - axis))
+        known = field.through_centre(field.evaluated, axis)
+        crossed = known & (False if field.crossed is None else field.through_centre(field.crossed, axis))
         axes.plot(direction.scaled[known & ~crossed], line[known & ~crossed], **RENDERED)
         axes.plot(direction.scaled[crossed], line[crossed], **CROSSED)
     if field.model is not None:
-        axes.plot(direction.scaled, field.model.take(other.centre, axis=1 - axis), "--", color=VERMILION, linewidth=0.9)
+        axes.plot(direction.scaled, field.through_centre(field.model, axis), "--", color=VERMILION, linewidth=0.9)
     axes.axvline(0, color="0.7", linewidth=0.5, zorder=0)
     axes.set_xlabel(direction.short_label)
     axes.xaxis.set_major_locator(MaxNLocator(INTERVALS))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.grid(True)
-    step = direction.unit / 10.0**direction.exponent
-    if np.isfinite(step) and step > 0:
-        upper = axes.secondary_xaxis("top", functions=(lambda x: np.divide(x, step), lambda u: np.multiply(u, step)))
-        upper.xaxis.set_major_locator(MaxNLocator(INTERVALS))
-        upper.set_xlabel(f"{curvature_text(direction)}\nsteps in curvature units", linespacing=1.4)
+    label = f"{direction.name}: curvature {quantity(direction.curvature)}\nsteps in curvature units"
+    direction.count_units(axes, INTERVALS, label, linespacing=1.4)
 
 
 def _legend(field: Plane) -> list[Line2D]:
@@ -148,10 +146,5 @@ def _legend(field: Plane) -> list[Line2D]:
     return handles
 
 
-def main() -> None:
-    """`python -m figures.slice2d RUN/probe`"""
-    script(draw, "slice2d")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(script, draw, "slice2d"))

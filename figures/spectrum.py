@@ -9,6 +9,7 @@ Ritz values    of the search for both ends: value against rank, on a symmetric l
 """
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,8 @@ from analysis.console.failures import program
 from analysis.records.quantities import measured, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from figures.density import draw_on
-from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, script, style
+from figures.scripts import script
+from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, style
 from landscape.errors import InputError
 
 DECADES = 5  # shown on either side of 0
@@ -148,10 +150,5 @@ def _legend_below(axes: Axes, handles: list[Line2D]) -> None:
     )  # fmt: skip
 
 
-def main() -> None:
-    """`python -m figures.spectrum RUN/probe`"""
-    script(draw, "spectrum", ProbeRecord)
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(script, draw, "spectrum", ProbeRecord))

@@ -4,9 +4,7 @@ Sizes are in inches, fonts in points.  Categories use the palette of Okabe and I
 uniform map cividis.  Figures are made without pyplot, so drawing has no global state.
 """
 
-import argparse
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,20 +16,19 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
-from analysis.records.records import ProbeRecord, read_record
 from landscape.errors import InputError
 from splat.model.untrusted import replacing
 
 COLUMN = 3.3
+SUFFIXES = ("png", "pdf", "svg")
 FIELD_MAP = "cividis"
 MISSING = "0.85"  # grey of points without a value
 
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
+BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (
     "#000000",
     "#E69F00",
     "#56B4E9",
     "#009E73",
-    "#F0E442",
     "#0072B2",
     "#D55E00",
     "#CC79A7",
@@ -85,7 +82,7 @@ def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:
     compression: of a PNG, 0 to 9; of photographs a low one takes a fifth of the time for a few percent more bytes.
     """
     path = Path(path)
-    if path.suffix not in (".png", ".pdf", ".svg"):
+    if path.suffix[1:] not in SUFFIXES:
         raise InputError(f"expected a file that ends with .png, .pdf or .svg, got {path}")
     path.parent.mkdir(parents=True, exist_ok=True)
     with style(), replacing(path) as partial:
@@ -104,36 +101,3 @@ def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:
 def literal(text: str) -> str:
     """Text from a record, with nothing in it read as mathematics."""
     return text.replace("$", r"\$")
-
-
-def script(draw: Callable[[Any], Figure], name: str, kind: type[ProbeRecord] | None = None) -> None:
-    """The command line of one figure: `python -m figures.NAME RUN/probe [--format pdf]`.  kind: of record, None: any."""
-
-    def drawn(folder: Path, suffix: str) -> list[Path]:
-        record = read_record(folder, kind)
-        return [save(draw(record), record.folder / f"{name}.{suffix}")]
-
-    folder_script(drawn, f"the figure {name} of a recorded probe", "probe")
-
-
-def folder_script(
-    draw: Callable[..., list[Path]], what: str, command: str, options: Sequence[argparse.ArgumentParser] = ()
-) -> None:
-    """A command line that draws into a folder of `landscape COMMAND` and prints the files.
-
-    draw(folder, suffix, ...): with what the options parse, by name.
-    """
-    parser = argparse.ArgumentParser(description=f"Draw {what} into its folder.", parents=options)
-    parser.add_argument("folder", help=f"a folder written by `landscape {command}`; -: the one named on standard input")
-    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
-    arguments = vars(parser.parse_args())
-    folder, suffix = arguments.pop("folder"), arguments.pop("format")
-    folder = sys.stdin.read() if folder == "-" else folder  # a name may hold a line break
-    if not folder:  # who was to name it has ended
-        return
-    try:
-        paths = draw(Path(folder), suffix, **arguments)
-    except (FileNotFoundError, ValueError) as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
-    print(*paths, sep="\n")

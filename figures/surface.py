@@ -10,6 +10,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import matplotlib as mpl
@@ -28,7 +29,8 @@ from analysis.records.records import Record
 from figures import render_surface
 from figures.plane import Direction, Plane, plane
 from figures.render_surface import Box
-from figures.style import BLACK, FIELD_MAP, VERMILION, new_figure, script, style
+from figures.scripts import script
+from figures.style import BLACK, FIELD_MAP, VERMILION, new_figure, style
 from landscape.errors import InputError
 from landscape.slices.eye import eye_over
 
@@ -189,10 +191,5 @@ def _edge(axes: Axes, box: Box, start: Sequence[float], end: Sequence[float]) ->
     axes.plot(points[:, 0], points[:, 1], color=BLACK, linewidth=0.6)
 
 
-def main() -> None:
-    """`python -m figures.surface RUN/probe`"""
-    script(draw, "surface")
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(script, draw, "surface"))

@@ -9,6 +9,7 @@ diamond: the interval does not decide it).  An arrow at the left edge is a zero,
 """
 
 import math
+from functools import partial
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -23,7 +24,8 @@ from analysis.records.findings import attribute_name, largest_steps, shares_per_
 from analysis.records.quantities import measured, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from analysis.records.schema import Trace
-from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, script, style
+from figures.scripts import script
+from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, style
 
 SIGNS: dict[str, dict[str, Any]] = {
     "positive": {"color": POSITIVE, "marker": "o", "markerfacecolor": POSITIVE},
@@ -41,7 +43,7 @@ def draw(record: Record[ProbeRecord]) -> Figure:
     with style():
         figure = new_figure(0.95 + 0.31 * len(entries))
         axes = figure.subplots()
-        _rows(axes, entries, [_signed(entry) for entry in entries.values()])
+        _rows(axes, entries)
         if shares:
             _draw_traces(axes, {name: scaled(entry, shares[name]) for name, entry in entries.items()},
                          {name: shares[name] * np.asarray(found) for name, found in samples.items()})  # fmt: skip
@@ -92,10 +94,9 @@ def _draw_traces(axes: Axes, entries: dict[str, Trace], samples: dict[str, np.nd
         axes.plot([value], [row], linestyle="none", **look)
 
 
-def _rows(axes: Axes, entries: dict[str, Trace], numbers: list[str]) -> None:
-    axes.set_yticks(
-        range(len(entries)), [f"{literal(attribute_name(k))}\n{n}" for k, n in zip(entries, numbers, strict=True)]
-    )
+def _rows(axes: Axes, entries: dict[str, Trace]) -> None:
+    numbers = {name: measured(entry.value, entry.standard_error) for name, entry in entries.items()}
+    axes.set_yticks(range(len(entries)), [f"{literal(attribute_name(k))}\n{n}" for k, n in numbers.items()])
     axes.set_ylim(len(entries) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
     axes.grid(True, axis="both")
@@ -123,10 +124,6 @@ def _sign(trace: Trace) -> str:
     return "undetermined" if trace.value is None or math.isnan(trace.value) else trace.sign
 
 
-def _signed(trace: Trace) -> str:
-    return measured(trace.value, trace.standard_error)
-
-
 def _drawable(number: float | None) -> TypeGuard[float]:
     return number is not None and math.isfinite(number) and number != 0
 
@@ -138,10 +135,5 @@ def _legend(entries: dict[str, Trace]) -> list[Line2D]:
     return [Line2D([], [], linestyle="none", label=sign, **look) for sign, look in SIGNS.items() if sign in present]
 
 
-def main() -> None:
-    """`python -m figures.traces RUN/probe`"""
-    script(draw, "traces", ProbeRecord)
-
-
 if __name__ == "__main__":
-    program(main)
+    program(partial(script, draw, "traces", ProbeRecord))

@@ -6,9 +6,8 @@ logarithmic where all of its values are positive and span more than a decade.  |
 where the quotient is negative.
 """
 
-import argparse
 import math
-import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,8 @@ from analysis.console.failures import program
 from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.quantities import exponent_of, power_of_ten, unit_suffix
 from analysis.records.run_files import ENDS, read_trajectory
-from figures.style import BLACK, RUNS, literal, new_figure, save, style
+from figures.scripts import table_script
+from figures.style import BLACK, RUNS, literal, new_figure, style
 from landscape.errors import InputError
 
 INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
@@ -165,28 +165,16 @@ def _tick(value: float, _: int | None) -> str:
     return power_of_ten(exponent) if leading == 1 else f"{leading}×{power_of_ten(exponent)}"
 
 
-def main() -> None:
-    """`python -m figures.trajectory OUT/trajectories.csv`"""
-    parser = argparse.ArgumentParser(
-        description="Draw the landscape along trainings, as written by `landscape trajectory`."
-    )
-    parser.add_argument("table", type=Path, help="trajectories.csv, as written by `landscape trajectory`")
-    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
-    arguments = parser.parse_args()
-    if arguments.table.is_dir():
-        print(
-            f"expected the table trajectories.csv as written by landscape trajectory, got the folder {arguments.table}; "
-            "name the table in it, or run landscape trajectory on the runs",
-            file=sys.stderr,
+def draw_named(path: Path) -> list[tuple[str, Figure]]:
+    """The figure of a trajectories.csv, named as that is.  InputError where the path is a folder."""
+    if path.is_dir():
+        raise InputError(
+            f"expected the table trajectories.csv as written by landscape trajectory, got the folder {path}; "
+            "name the table in it, or run landscape trajectory on the runs"
         )
-        sys.exit(2)
-    try:
-        figure = draw(read_trajectory(arguments.table))
-        print(save(figure, arguments.table.with_suffix(f".{arguments.format}")))
-    except (FileNotFoundError, ValueError) as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    return [(path.stem, draw(read_trajectory(path)))]
 
 
 if __name__ == "__main__":
-    program(main)
+    what = "the landscape along trainings, as written by `landscape trajectory`"
+    program(partial(table_script, draw_named, what, "trajectories.csv", "trajectory"))

@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
+from figures.scripts import folder_script
 from figures.style import (
     BLACK,
     BLUE,
@@ -20,7 +21,6 @@ from figures.style import (
     PURPLE,
     SKY,
     VERMILION,
-    folder_script,
     literal,
     new_figure,
     save,

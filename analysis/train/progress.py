@@ -12,7 +12,6 @@ seconds, cpu       that the steps so far took, by the clock and of all processor
 
 from math import isnan, nan
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -71,9 +70,7 @@ class TrainingProgress:
         self.bars.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.bars.stop()
         self.file.close()
         if self.scalars is not None:

@@ -6,7 +6,6 @@ RUN/test/panels/NAME.png    side by side: photograph, render, and the error, whi
                             |render - photograph|: black is 0, the brightest ERROR_SHOWN or more; 0 outside a mask
 """
 
-import io
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -17,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -30,6 +28,7 @@ from analysis.records.run_files import CHECKPOINT, METRICS
 from analysis.train.training_time import TrainingTime
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.view import View
+from splat.scenes.write import bytes_of, png
 from splat.training.checkpoint import write_atomically
 from splat.training.score.evaluate import Evaluation, ViewScore, evaluate
 from splat.training.score.perceptual import MissingPerceptual, load_lpips
@@ -48,8 +47,8 @@ def report(training: Training, views: Sequence[View], held_out: Sequence[View], 
     names = render_names(list(photographs))
 
     def keep(name: str, image: Tensor) -> None:
-        write_atomically(renders / names[name], _png(pixels(image)))
-        write_atomically(renders / PANELS / names[name], _png(panel(image, photographs[name])))
+        write_atomically(renders / names[name], png(bytes_of(image)))
+        write_atomically(renders / PANELS / names[name], png(panel(image, photographs[name])))
 
     console = Console()
     try:
@@ -106,10 +105,6 @@ def render_names(views: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def pixels(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    return (image.cpu().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
-
-
 def panel(image: Float[Tensor, "3 h w"], view: View) -> UInt8[np.ndarray, "h w3 3"]:
     """Photograph, render and error side by side."""
     from matplotlib import colormaps  # half a second of imports
@@ -120,13 +115,7 @@ def panel(image: Float[Tensor, "3 h w"], view: View) -> UInt8[np.ndarray, "h w3 
         error = torch.where(view.mask, error, 0.0)
     shown = colormaps["inferno"]((error / ERROR_SHOWN).clamp(0, 1).cpu().numpy(), bytes=True)[..., :3]
     gap = np.full((shown.shape[0], GAP, 3), 255, np.uint8)
-    return np.concatenate([pixels(view.image), gap, pixels(render), gap, shown], axis=1)
-
-
-def _png(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="PNG")
-    return buffer.getvalue()
+    return np.concatenate([bytes_of(view.image), gap, bytes_of(render), gap, shown], axis=1)
 
 
 def _scores(evaluation: Evaluation) -> dict[str, Any]:

@@ -174,6 +174,12 @@ def pixel_coordinates(camera: Camera, xyz: Float[Tensor, "n 3"]) -> tuple[Float[
     return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1), z
 
 
+def lifted(camera: Camera, pixel: Float[Tensor, "n 2"], z: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+    """The points at these pixels and depths, world frame."""
+    x, y = (pixel[:, 0] - camera.cx) / camera.fx * z, (pixel[:, 1] - camera.cy) / camera.fy * z
+    return camera.centre + torch.stack([x, y, z], dim=1) @ camera.rotation
+
+
 def inside_image(
     camera: Camera, xyz: Float[Tensor, "n 3"], depth_range: tuple[float, float] | None = None
 ) -> Bool[Tensor, " n"]:

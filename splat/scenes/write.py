@@ -1,5 +1,6 @@
 """Write a scene as `transforms.json`, PNG pictures and a PLY file of points, the format that `transforms.py` reads."""
 
+import io
 import json
 import os
 import shutil
@@ -11,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from PIL import Image
+from torch import Tensor
 
 from splat.model.camera import Camera
 from splat.model.files.ply import ply_bytes
@@ -21,6 +24,18 @@ from splat.scenes.view import Frame, Points
 
 POINTS_FILE = "points.ply"
 COLOURS = ("red", "green", "blue")
+
+
+def bytes_of(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture in 8 bits a colour."""
+    return (image.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
+
+
+def png(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Content of a PNG file."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG")
+    return buffer.getvalue()
 
 
 @contextmanager
@@ -57,8 +72,7 @@ def _write_into(scene: Scene, folder: Path) -> None:
     for file, frame in files.items():
         path = folder / file
         path.parent.mkdir(parents=True, exist_ok=True)
-        pixels = (frame.view().image * 255).round().to(torch.uint8)
-        Image.fromarray(pixels.permute(1, 2, 0).numpy()).save(path)
+        path.write_bytes(png(bytes_of(frame.view().image)))
     entries = [{"file_path": file, **_camera(frame.camera)} for file, frame in files.items()]
     (folder / SINGLE_FILE).write_text(json.dumps({**content, "frames": entries}, indent=1), encoding="utf-8")
 

@@ -53,7 +53,7 @@ REMEDY = "take another copy of the file, or train anew"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Checkpoint(Brief):
-    """A saved training, its scene, and the version of torch that wrote it.
+    """A saved training and its scene.
 
     origin: what was assumed of another tool's file (`foreign_training`).  all_views: number of views that it was trained on,
     where the scene names fewer (`thinned`).
@@ -61,7 +61,6 @@ class Checkpoint(Brief):
 
     training: Training
     scene: SceneReference
-    torch_version: str
     origin: dict[str, Any] | None = None
     all_views: int | None = None
 
@@ -200,7 +199,7 @@ def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:
     """
     if is_foreign(path):
         training, scene, origin = foreign_training(path, ask, picture)
-        return Checkpoint(training, scene, str(torch.__version__), origin)
+        return Checkpoint(training, scene, origin)
     loaded = load_checkpoint(path)
     if needless := [name for name, value in vars(ask).items() if value is not None and name != "scene"]:
         raise InputError(
@@ -280,7 +279,7 @@ def _checkpoint(content: Any) -> Checkpoint:
             raise InputError(f"it has {len(found)} {each} for {len(scene.train)} training views")
     if not all(index < len(scene.train) for index in training.order):
         raise InputError(f"its order does not index its {len(scene.train)} training views")
-    return Checkpoint(training, scene, file.torch)
+    return Checkpoint(training, scene)
 
 
 def restored_training(content: dict[str, Any]) -> Training:

@@ -136,15 +136,12 @@ class Densified:
     """Result of density control.
 
     gaussians: the new set.  parents: index of the old Gaussian that each comes from.  fresh: which are not kept, but clones or
-    draws.  cloned, split, pruned: numbers of Gaussians.
+    draws.
     """
 
     gaussians: Gaussians
     parents: Int[Tensor, " n"]
     fresh: Bool[Tensor, " n"]
-    cloned: int
-    split: int
-    pruned: int
 
 
 @torch.no_grad()
@@ -175,9 +172,7 @@ def densify(
     if prune_large:
         assert settings.prune_scale is not None
         remain &= result.log_scales.amax(dim=1) <= log(settings.prune_scale * extent)
-    return Densified(
-        result.select(remain), parents[remain], fresh[remain], len(clone), len(split), int((~remain).sum())
-    )
+    return Densified(result.select(remain), parents[remain], fresh[remain])
 
 
 def neighbours(gaussians: Gaussians, count: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:

@@ -37,7 +37,7 @@ from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.scenes.scene import Scene
 from splat.scenes.sfm.triangulation import triangulated_points
-from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
+from splat.scenes.view import Frame, Points, View, inside_image, lifted, pixel_coordinates
 
 Source = Literal["scene", "points", "triangulated", "dense", "random", "box"]
 OPACITY = 0.1
@@ -185,11 +185,10 @@ def _random_batch(
     xyz, rgb = torch.empty(n, 3, dtype=torch.float64), torch.empty(n, 3)
     for i, (view, (near, far)) in enumerate(zip(views, ranges)):
         camera, mine = view.camera, which == i
-        u, v = (uniform[mine, :2] * torch.tensor([camera.width, camera.height])).unbind(-1)
-        z = near + (far - near) * uniform[mine, 2]
-        local = torch.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], dim=-1)
-        xyz[mine] = camera.centre + local @ camera.rotation
-        rgb[mine] = view.image[:, v.long(), u.long()].T
+        pixel = uniform[mine, :2] * torch.tensor([camera.width, camera.height])
+        xyz[mine] = lifted(camera, pixel, near + (far - near) * uniform[mine, 2])
+        u, v = pixel.long().unbind(-1)
+        rgb[mine] = view.image[:, v, u].T
     return xyz, rgb
 
 

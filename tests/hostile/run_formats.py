@@ -133,7 +133,7 @@ class Records(Format):
         record(self.root / "probe", 1.0)
         self.second = self.root / "other"
         record(self.second / "probe", 0.5)
-        self.checkpoint = Checkpoint(tiny_training(), REFERENCE, "")
+        self.checkpoint = Checkpoint(tiny_training(), REFERENCE)
         self.by_bytes = False
 
     def use(self) -> None:

@@ -88,7 +88,7 @@ class ViewBench:
         self.background = workload.background.to(self.like)
         self.loss = loss_against(self.view.image, workload.loss, self.like)
         self.projected = projected(workload.gaussians, self.lens)
-        self.raster = self._rasterize()
+        self.raster = self._rasterize(self.projected)
         self.cotangent = self.loss.linearize(self.raster.planes).gradient
         self.adjoint = self.raster.backward(self.cotangent)
         self.linearized = self._linearize()
@@ -96,9 +96,9 @@ class ViewBench:
         self.vectors = {K: draw_probes(self.like.numel(), K, generator, self.like.dtype) for K in vectors}
         self.lack: str | None = None
 
-    def _rasterize(self) -> Any:
+    def _rasterize(self, found: tuple[torch.Tensor, torch.Tensor, torch.Tensor]) -> Any:
         camera, settings = self.view.camera, self.workload.settings
-        return rasterize(*self.projected, self.background, camera.width, camera.height, settings)
+        return rasterize(*found, self.background, camera.width, camera.height, settings)
 
     def _linearize(self) -> Any:
         w = self.workload
@@ -107,8 +107,7 @@ class ViewBench:
     def gradient(self) -> torch.Tensor:
         """Gradient of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
         splats, depths, drawn = projected(self.workload.gaussians, self.lens)
-        camera, settings = self.view.camera, self.workload.settings
-        raster = rasterize(splats, depths, drawn, self.background, camera.width, camera.height, settings)
+        raster = self._rasterize((splats, depths, drawn))
         adjoint = raster.backward(self.loss.linearize(raster.planes).gradient)
         return self._to_parameters(splats, drawn, adjoint)
 
@@ -161,7 +160,7 @@ class ViewBench:
         """Calls whose times the ratios compare."""
         products = {f"H v {K}": lambda U=U: self.linearized.hvp(U) for K, U in self.vectors.items()}
         return {
-            "rasterizer": lambda: self._rasterize().backward(self.cotangent),
+            "rasterizer": lambda: self._rasterize(self.projected).backward(self.cotangent),
             "gradient": self.gradient,
             "gradient, autograd": self.gradient_by_autograd,
             "linearize": self._linearize,

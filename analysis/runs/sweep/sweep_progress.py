@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from datetime import timedelta
 from statistics import mean
 from time import monotonic
-from types import TracebackType
 from typing import Literal
 
 from rich.console import Console
@@ -48,9 +47,7 @@ class SweepProgress:
         self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
     def started(self, cell: Cell, stage: Stage) -> None:

@@ -25,16 +25,7 @@ TYPES = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
-NAMES = {
-    "i1": "char",
-    "u1": "uchar",
-    "i2": "short",
-    "u2": "ushort",
-    "i4": "int",
-    "u4": "uint",
-    "f4": "float",
-    "f8": "double",
-}
+NAMES = {kind: name for name, kind in reversed(TYPES.items())}  # the first name of each
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 MAGIC, END, LONGEST_HEADER = b"ply", b"end_header", 1 << 20
 

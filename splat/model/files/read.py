@@ -92,15 +92,14 @@ def _read(path: Path, content: bytes) -> SplatFile:
 
 def _with_settings(found: SplatFile, path: Path) -> SplatFile:
     """The file with the settings in graphdeco's `cfg_args` beside the model, if it comes from graphdeco or a fork of it."""
-    parts = path.resolve().parts
-    model = path.resolve().parents[2] if parts[-3:-2] == ("point_cloud",) else path.resolve().parent
-    settings = read_cfg_args(model / "cfg_args") if found.format in ("PLY", "graphdeco checkpoint") else {}
+    of_graphdeco = found.format in ("PLY", "graphdeco checkpoint")
+    settings = read_cfg_args(model_folder(path) / "cfg_args") if of_graphdeco else {}
     if not settings:
         settings = read_yaml_lines(path.resolve().parents[1])
         return replace(found, antialiased=found.antialiased or settings.get("antialiased") is True, settings=settings)
-    step = found.step
-    if step is None and parts[-2].removeprefix("iteration_").isdigit():
-        step = int(parts[-2].removeprefix("iteration_")[:9])
+    step, counted = found.step, path.resolve().parent.name.removeprefix("iteration_")
+    if step is None and counted.isdigit():
+        step = int(counted[:9])
     return replace(
         found,
         tool=found.tool or "graphdeco",
@@ -108,6 +107,12 @@ def _with_settings(found: SplatFile, path: Path) -> SplatFile:
         antialiased=found.antialiased or settings.get("antialiasing") is True,
         settings=settings,
     )
+
+
+def model_folder(path: Path) -> Path:
+    """The folder of a file's model, where graphdeco writes `cfg_args` and `cameras.json`."""
+    path = path.resolve()
+    return path.parents[2] if path.parts[-3:-2] == ("point_cloud",) else path.parent
 
 
 def read_yaml_lines(folder: Path) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from splat.model.camera import Camera
-from splat.scenes.view import Points, View, pixel_coordinates
+from splat.scenes.view import Points, View, lifted, pixel_coordinates
 
 LARGEST = 400  # px, of the longer side
 STRIDE = 2
@@ -95,18 +95,12 @@ def depth_map(
 def _planes(camera: Camera, others: Sequence[Camera], near: float) -> Float[Tensor, " planes"]:
     """1 / z of the planes."""
     corners = torch.tensor([[x, y] for x in (0, camera.width) for y in (0, camera.height)], dtype=torch.float64)
-    ends = [_lifted(camera, corners, torch.full((4,), z, dtype=torch.float64)) for z in (near, BEYOND * near)]
+    ends = [lifted(camera, corners, torch.full((4,), z, dtype=torch.float64)) for z in (near, BEYOND * near)]
     moves = [
         torch.stack([pixel_coordinates(other, end)[0] for end in ends]).diff(dim=0).norm(dim=2) for other in others
     ]
     count = min(max(ceil(max(float(move.max()) for move in moves)) + 1, PLANES[0]), PLANES[1])
     return torch.linspace(1 / (BEYOND * near), 1 / near, count)
-
-
-def _lifted(camera: Camera, pixel: Float[Tensor, "n 2"], z: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-    """The points at these pixels and depths, world frame."""
-    x, y = (pixel[:, 0] - camera.cx) / camera.fx * z, (pixel[:, 1] - camera.cy) / camera.fy * z
-    return camera.centre + torch.stack([x, y, z], dim=1) @ camera.rotation
 
 
 def _scores(
@@ -166,7 +160,7 @@ def _fused(views: Sequence[View], maps: Sequence[DepthMap]) -> Points:
         row, column = ((own.z > 0) & ~covered[i])[::STRIDE, ::STRIDE].nonzero().unbind(1)
         row, column = STRIDE * row, STRIDE * column
         pixel = torch.stack([column, row], dim=1).double() + 0.5
-        xyz = _lifted(own.camera, pixel, own.z[row, column].double())
+        xyz = lifted(own.camera, pixel, own.z[row, column].double())
         agree = torch.stack([_confirmed(own.camera, pixel, xyz, other) for other in maps])
         agree[i] = True
         found = (agree.sum(dim=0) >= 2) & _opaque(view, xyz)
@@ -191,7 +185,7 @@ def _confirmed(
     column, row = there.nan_to_num(-1, -1, -1).long().unbind(1)
     measured = torch.zeros_like(z)
     measured[inside] = other.z[row[inside], column[inside]].double()
-    back, _ = pixel_coordinates(camera, _lifted(other.camera, there, measured))
+    back, _ = pixel_coordinates(camera, lifted(other.camera, there, measured))
     same = ((measured - z).abs() < MAX_DEPTH * z) & ((back - pixel).norm(dim=1) < MAX_REPROJECTION)
     return inside & (measured > 0) & same
 

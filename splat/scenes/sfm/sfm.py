@@ -13,6 +13,7 @@ The scene is a folder with `images` and `sparse/0`, as the tools of 3DGS expect 
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -157,12 +158,9 @@ def _match(database: Path, names: Sequence[str], pairs: Path, on_progress: Progr
 
 
 def _why_there_is_no_model(path: Path, photos: int) -> str:
-    database = pycolmap.Database.open(path)
-    try:
+    with closing(pycolmap.Database.open(path)) as database:
         features = database.num_keypoints() / photos
         pairs = sum(inliers > 0 for inliers in database.read_two_view_geometry_num_inliers()[1])
-    finally:
-        database.close()
     return (
         f"expected photographs of one scene from different places, could not place any: of {photos} photographs with "
         f"{features:.0f} features each, {pairs} of {photos * (photos - 1) // 2} pairs match; take sharp photographs that "

@@ -11,18 +11,17 @@ because nothing refutes the wrong matches that it adds where only two views see 
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-import torch
-from PIL import Image
 
 from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.scenes.formats.colmap import points_of
 from splat.scenes.view import Points, View
+from splat.scenes.write import bytes_of, png
 
 SEED = 0  # of RANSAC: the same views give the same points
 
@@ -38,8 +37,7 @@ def triangulated_points(views: Sequence[View]) -> Points:
         posed = _posed_without_points(views)
         _write_database(posed, database)
         for image, view in zip(_in_order(posed), views, strict=True):
-            pixels = (view.image * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
-            Image.fromarray(pixels).save(pictures / image.name)
+            (pictures / image.name).write_bytes(png(bytes_of(view.image)))
         features = pycolmap.FeatureExtractionOptions()
         features.use_gpu = False
         features.sift.estimate_affine_shape = True
@@ -106,8 +104,7 @@ def _lens(camera: Camera, camera_id: int) -> pycolmap.Camera:
 
 def _write_database(model: pycolmap.Reconstruction, path: Path) -> None:
     """Write cameras and images under the ids of the model, by which `triangulate_points` finds them."""
-    database = pycolmap.Database.open(path)
-    try:
+    with closing(pycolmap.Database.open(path)) as database:
         for camera in model.cameras.values():
             database.write_camera(camera, use_camera_id=True)
         for rig in model.rigs.values():
@@ -116,8 +113,6 @@ def _write_database(model: pycolmap.Reconstruction, path: Path) -> None:
             database.write_frame(frame, use_frame_id=True)
         for image in _in_order(model):
             database.write_image(image, use_image_id=True)
-    finally:
-        database.close()
 
 
 def _in_order(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

@@ -148,5 +148,4 @@ def confirmed(gaussians: Gaussians, others: Gaussians, distance: float) -> Bool[
 
 def _pruned(gaussians: Gaussians, stays: Bool[Tensor, " n"]) -> Densified:
     kept = stays.nonzero()[:, 0]
-    fresh = torch.zeros_like(kept, dtype=torch.bool)
-    return Densified(gaussians.select(kept), kept, fresh, cloned=0, split=0, pruned=len(stays) - len(kept))
+    return Densified(gaussians.select(kept), kept, fresh=torch.zeros_like(kept, dtype=torch.bool))

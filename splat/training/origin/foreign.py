@@ -5,7 +5,6 @@ its convention holds.  Before anything is measured the Gaussians are rendered on
 picture, frame, images or conventions are wrong, and so would be all numbers.
 """
 
-import io
 import json
 import re
 from collections.abc import Sequence
@@ -17,11 +16,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from PIL import Image
 
 from landscape.errors import InputError
 from splat.losses.reference import LossSettings, psnr
-from splat.model.files.read import read_splats
+from splat.model.files.read import model_folder, read_splats
 from splat.model.files.splat_file import SplatFile
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -29,6 +27,7 @@ from splat.render.render import render
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, explicit_split, split_scene
 from splat.scenes.view import View
+from splat.scenes.write import bytes_of, png
 from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_frame, posed
 from splat.training.origin.presets import PRESETS, Preset, preset_of, render_of
 from splat.training.origin.scene_reference import SceneReference
@@ -143,11 +142,7 @@ def _split(scene: Scene, found: SplatFile, ask: Foreign, path: Path) -> tuple[Sp
 
 def _used(path: Path, scene: Scene) -> set[str]:
     """Names of the scene's images that graphdeco's `cameras.json` lists; empty where there is none, or one of another scene."""
-    file = (
-        path.resolve().parents[2] / "cameras.json"
-        if "point_cloud" in path.resolve().parts[-3:]
-        else path.parent / "cameras.json"
-    )
+    file = model_folder(path) / "cameras.json"
     if not file.is_file():
         return set()
     try:
@@ -259,8 +254,5 @@ def _suspicion(image: torch.Tensor, config: TrainConfig, name: str, worlds: int)
 
 
 def _save_side_by_side(image: torch.Tensor, view: View, path: Path) -> None:
-    both = torch.cat([image, view.image], dim=2).permute(1, 2, 0)
-    buffer = io.BytesIO()
-    Image.fromarray((both * 255).round().to(torch.uint8).numpy()).save(buffer, format="PNG")
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(buffer.getvalue())
+    path.write_bytes(png(bytes_of(torch.cat([image, view.image], dim=2))))

@@ -152,6 +152,7 @@ def test_the_figure_fits_its_column_and_shows_the_recorded_times(recorded):
     points = sorted(zip(lines["pixels"], lines["minimum_ms"]))
     np.testing.assert_array_equal(np.asarray(line.get_xydata()), points)
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    assert [text.get_text() for text in drawn.legends[0].get_texts()][-1] == "in proportion"
 
 
 def test_the_figure_from_the_command_line_and_its_refusal(recorded, tmp_path):

@@ -145,4 +145,4 @@ def unpool(gaussians: Gaussians, extent: float, settings: FSGS) -> Densified:
     result.means[n:] = (gaussians.means[source] + gaussians.means[destination]) / 2
     result.quats[n:] = torch.tensor([1.0, 0, 0, 0]).to(result.flat)
     result.sh[n:] = 0
-    return Densified(result, parents, torch.arange(len(parents), device=device) >= n, cloned=0, split=0, pruned=0)
+    return Densified(result, parents, torch.arange(len(parents), device=device) >= n)

@@ -1,0 +1,95 @@
+"""Command lines of the figures: `python -m figures.NAME` of a record's folder, of a table, or of two runs.
+
+Each prints the files that it has written and returns the exit code: 2 where its input is not what it expects, which it says on
+stderr.
+"""
+
+import sys
+from argparse import ArgumentParser
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from analysis.records.records import ProbeRecord, read_record
+from figures.style import SUFFIXES, save
+from landscape.errors import InputError
+
+
+def script(draw: Callable[[Any], Figure], name: str, kind: type[ProbeRecord] | None = None) -> int:
+    """`python -m figures.NAME RUN/probe [--format pdf]`: one figure, beside its record.  kind: of record, None: any."""
+
+    def drawn(folder: Path, suffix: str) -> list[Path]:
+        record = read_record(folder, kind)
+        return [save(draw(record), record.folder / f"{name}.{suffix}")]
+
+    return folder_script(drawn, f"the figure {name} of a recorded probe", "probe")
+
+
+def folder_script(
+    draw: Callable[..., list[Path]], what: str, command: str, options: Sequence[ArgumentParser] = ()
+) -> int:
+    """Draw into a folder of `landscape COMMAND`.
+
+    draw(folder, suffix, ...): with what the options parse, by name.
+    """
+    parser = ArgumentParser(description=f"Draw {what} into its folder.", parents=options)
+    parser.add_argument("folder", help=f"a folder written by `landscape {command}`; -: the one named on standard input")
+    _add_format(parser)
+    arguments = vars(parser.parse_args())
+    folder, suffix = arguments.pop("folder"), arguments.pop("format")
+    folder = sys.stdin.read() if folder == "-" else folder  # a name may hold a line break
+    if not folder:  # who was to name it has ended
+        return 0
+    return print_files(lambda: draw(Path(folder), suffix, **arguments))
+
+
+def table_script(draw: Callable[[Path], Iterable[tuple[str, Figure]]], what: str, name: str, command: str) -> int:
+    """Draw beside a table of `landscape COMMAND`, which is called `name` there.
+
+    draw(table): names of files, without suffix, each with its figure.
+    """
+    parser = ArgumentParser(description=f"Draw {what}.")
+    parser.add_argument("table", type=Path, help=f"{name}, as written by `landscape {command}`")
+    _add_format(parser)
+    options = parser.parse_args()
+
+    def drawn() -> Iterator[Path]:
+        try:
+            for stem, figure in draw(options.table):
+                yield save(figure, options.table.with_name(f"{stem}.{options.format}"))
+        except InputError:
+            raise
+        except (FileNotFoundError, ValueError, KeyError, IndexError) as error:
+            raise InputError(
+                f"expected {name} as written by landscape {command}, got {options.table}: {error}"
+            ) from None
+
+    return print_files(drawn)
+
+
+def runs_script(draw: Callable[[Sequence[Path]], Figure], name: str) -> int:
+    """Draw two runs into a file."""
+    parser = ArgumentParser(description=f"Draw {name} from the records of two runs.")
+    parser.add_argument(
+        "runs", type=Path, nargs=2, metavar="RUN", help="folders of landscape train: 3DGS, then StableGS"
+    )
+    parser.add_argument("--out", type=Path, default=Path(f"{name}.png"), help="PNG, PDF or SVG, by its suffix")
+    options = parser.parse_args()
+    return print_files(lambda: [save(draw(options.runs), options.out)])
+
+
+def print_files(draw: Callable[[], Iterable[Path]]) -> int:
+    """Print each file as it is written, or what is wrong with the input; returns the exit code."""
+    try:
+        for path in draw():
+            print(path)
+    except (FileNotFoundError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def _add_format(parser: ArgumentParser) -> None:
+    parser.add_argument("--format", choices=SUFFIXES, default="png")
