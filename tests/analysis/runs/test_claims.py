@@ -289,10 +289,14 @@ def names_in(file: str) -> set[str]:
     return names
 
 
-def test_every_stored_training_is_a_cell_of_the_file_that_repeats_it():
-    rows = pd.read_csv(NOTEBOOKS / "results" / "study.csv")
-    assert set(rows["method"]) <= names_in("study_small.toml")
-    cells = read_sweep(NOTEBOOKS / "study_small.toml").cells
+@pytest.mark.parametrize(
+    ("table", "file"),
+    [("study.csv", "study_small.toml"), ("study_full.csv", "study.toml"), ("study_lego.csv", "study_lego.toml")],
+)
+def test_every_stored_training_is_a_cell_of_the_file_that_repeats_it(table, file):
+    rows = pd.read_csv(NOTEBOOKS / "results" / table)
+    assert set(rows["method"]) <= names_in(file)
+    cells = read_sweep(NOTEBOOKS / file).cells
     assert set(rows["steps"]) == {cell.steps for cell in cells} and set(rows["seed"]) <= {cell.seed for cell in cells}
 
 
