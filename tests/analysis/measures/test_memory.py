@@ -105,7 +105,7 @@ def test_a_probe_in_little_memory_says_what_it_needs_and_what_would_fit(tmp_path
     write_transforms_scene(made.scene, tmp_path / "scene")
     assert main(["train", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--iterations", "1"]) == 0
 
-    def short(objective: SceneObjective, *_: object) -> None:
+    def short(objective: SceneObjective, *_: object, **__: object) -> None:
         free(monkeypatch, objective.linearized.first.bytes)
         raise MemoryError
 
