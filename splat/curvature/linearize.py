@@ -171,7 +171,7 @@ class LinearizedView:
         """`block_diagonal` for each of parts (True: Gauss-Newton); they share the pass for the coupling of pixels."""
         raster, index = self._raster, self._index
         if approximate or not self._couples:
-            curvature, coupled = self._loss.diagonal, 0.0
+            curvature, coupled = self._loss.diagonal, None
         elif isinstance(raster, CpuRaster):
             assert isinstance(self._loss, CpuLinearLoss)
             coupling = self._loss.coupling()
@@ -184,7 +184,9 @@ class LinearizedView:
             )
         found = []
         for gauss_newton in parts:
-            blocks = self._raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton) + coupled
+            blocks = self._raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton)
+            if coupled is not None:
+                blocks += coupled
             found.append(PerGaussianBlocks(*self._projection.blocks(blocks, not gauss_newton)))
             if not gauss_newton:
                 found[-1].add_diagonal(self._regularizers.second)
