@@ -59,8 +59,8 @@ def test_the_curvature_of_the_nerf_is_that_of_its_dense_hessian():
 def test_the_comparison_says_what_the_stored_table_says():
     printed, names = story("stablegs_vs_3dgs")
     rows, lines = names["rows"], printed.splitlines()
-    both = [rows[rows["method"] == method].set_index("seed")["trace_means"] for method in ("stablegs", "3dgs")]
-    ratio = np.exp(np.log(both[0] / both[1]).dropna().mean())
+    both = [rows[rows["method"] == method].groupby("seed")["trace_means"].mean() for method in ("stablegs", "3dgs")]
+    ratio = np.exp(np.log(both[0] / both[1]).mean())  # a seed may have been trained on several machines
     (line,) = [line for line in lines if line.startswith("StableGS over 3DGS, trace_means: ")]
     assert float(line.split(": ")[1].split()[0]) == pytest.approx(ratio, rel=0.01)
     assert sum(bool(re.match(r"[1-9]\. ", line)) for line in lines) == 9
