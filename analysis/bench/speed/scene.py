@@ -108,7 +108,7 @@ class ViewBench:
         """Gradient of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
         splats, depths, drawn = projected(self.workload.gaussians, self.lens)
         raster = self._rasterize((splats, depths, drawn))
-        adjoint = raster.backward(self.loss.linearize(raster.planes).gradient)
+        adjoint = raster.backward(self.loss.linearize(raster.planes, second_order=False).gradient)
         return self._to_parameters(splats, drawn, adjoint)
 
     def _to_parameters(self, splats: torch.Tensor, drawn: torch.Tensor, adjoint: Any) -> torch.Tensor:
