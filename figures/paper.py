@@ -27,6 +27,7 @@ from analysis.records.run_files import read_trajectory
 from analysis.runs.claims.effects import BASE, LEAST, SCORE, STABLE, Interval, gains, log_ratios, numbers
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
+from analysis.runs.claims.table import FILE, read_table
 from figures.claims import draw_claims, draw_predictors, words_of
 from figures.scripts import print_files
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
@@ -59,10 +60,10 @@ AXES: tuple[tuple[str, str, float | None], ...] = (
 
 def make(results: Path, out: Path) -> Iterator[Path]:
     """Draw everything; gives each file when it is there.  FileNotFoundError where there is no study."""
-    table = results / "study.csv"
+    table = results / FILE
     if not table.is_file():
         raise FileNotFoundError(f"expected study.csv in {results}, as landscape claims writes it, found none")
-    rows = pd.read_csv(table)
+    rows = read_table(table)
     drawn = {
         "claims": draw_claims(effect_table(judgements(rows))),
         "predictors": draw_predictors(predictors(rows)),

@@ -85,7 +85,7 @@ def print_files(draw: Callable[[], Iterable[Path]]) -> int:
     try:
         for path in draw():
             print(path)
-    except (FileNotFoundError, InputError) as error:
+    except (FileNotFoundError, ValueError) as error:
         print(error, file=sys.stderr)
         return 2
     return 0

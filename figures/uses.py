@@ -26,6 +26,7 @@ from figures.style import (
     save,
     style,
 )
+from landscape.errors import InputError
 
 SCORES = {
     "rise": ("rise of the loss", VERMILION),
@@ -147,11 +148,13 @@ def draw_uncertainty(path: Path) -> Figure:
 
 def draw(folder: Path, suffix: str = "png") -> list[Path]:
     """Draw the pictures whose numbers are in the folder; returns their files."""
-    views = [save(draw_uncertainty(path), path.with_suffix(f".{suffix}")) for path in sorted(folder.glob("view-*.npz"))]
-    return views + [
-        save(make(pd.read_csv(folder / f"{name}.csv")), folder / f"{name}.{suffix}")
-        for name, make in PICTURES.items()
-        if (folder / f"{name}.csv").is_file()
+    views, tables = sorted(folder.glob("view-*.npz")), [name for name in PICTURES if (folder / f"{name}.csv").is_file()]
+    if not (views or tables):
+        raise InputError(
+            f"expected what landscape prune --curve, next-view or uncertainty writes in {folder}, found none"
+        )
+    return [save(draw_uncertainty(path), path.with_suffix(f".{suffix}")) for path in views] + [
+        save(PICTURES[name](pd.read_csv(folder / f"{name}.csv")), folder / f"{name}.{suffix}") for name in tables
     ]
 
 

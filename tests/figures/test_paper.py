@@ -5,7 +5,9 @@ import pandas as pd
 import pytest
 from matplotlib.text import Text
 
+from figures import uses
 from figures.paper import AXES, captions, draw_axes, draw_budget, draw_index, main, method_words
+from landscape.errors import InputError
 from tests.analysis.runs.test_claims import OTHERWISE, PAPER, made_up
 from tests.figures.test_figures import laid_out
 
@@ -69,3 +71,16 @@ def test_the_index_over_the_steps_has_the_band_of_all_seeds():
 def test_a_folder_without_a_study_is_refused_in_a_sentence(tmp_path, capsys):
     assert main([str(tmp_path)]) == 2
     assert "expected study.csv" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", ["", 'a,"b\n1', "x,y\n1,2\n"], ids=["empty", "damaged", "another table"])
+def test_a_table_that_is_none_of_a_study_is_refused_in_a_sentence(tmp_path, capsys, content):
+    (tmp_path / "study.csv").write_text(content)
+    assert main([str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert f"expected the table of a study in {tmp_path / 'study.csv'}" in said and said.count("\n") == 1
+
+
+def test_a_folder_without_results_of_the_uses_is_refused(tmp_path):
+    with pytest.raises(InputError, match="expected what landscape prune --curve, next-view or uncertainty writes"):
+        uses.draw(tmp_path)

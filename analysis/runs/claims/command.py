@@ -22,7 +22,8 @@ from analysis.records.json_files import json_text, plain
 from analysis.records.report import pictures_in, template_environment
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import LEAST, Judgement, effect_table, judgements
-from analysis.runs.claims.study import FILE, study, unended
+from analysis.runs.claims.study import study, unended
+from analysis.runs.claims.table import FILE
 from analysis.runs.options import ClaimsOptions
 from splat.training.checkpoint import write_atomically
 

@@ -25,7 +25,6 @@
 A number that a run does not have is empty.
 """
 
-import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import log, nan, sqrt
@@ -40,7 +39,8 @@ from analysis.measures.units import step_lengths
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS, Made, MapRecord, read_map, read_scores
 from analysis.runs.claims.effects import STRETCHED
-from analysis.runs.sweep.sweep_results import PROBE, REASONS, metrics_of, probe_of
+from analysis.runs.claims.table import FILE, KEYS, read_table
+from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
 from landscape.errors import InputError
 from splat.model.typed import leaves
 from splat.training.checkpoint import load_checkpoint
@@ -48,9 +48,6 @@ from splat.training.methods.protocols import presets
 from splat.training.start import Source
 from splat.training.state import LearningRates, TrainConfig
 
-FILE = "study.csv"
-KEYS = ("scene", "method", "seed", "steps", "views")
-TEXTS = ("scene", "method", "size", "date", "machine", "commit", *REASONS)  # columns of text; the others are numbers
 SAMPLES = 10  # the paper's B
 
 
@@ -59,7 +56,7 @@ def study(paths: Sequence[Path]) -> pd.DataFrame:
 
     Raises InputError where a path has no run, or a run is there twice on one machine.
     """
-    tables = [_stored(path) if path.is_file() else pd.DataFrame(map(row_of, _runs(path))) for path in paths]
+    tables = [read_table(path) if path.is_file() else pd.DataFrame(map(row_of, _runs(path))) for path in paths]
     rows = pd.concat(tables, ignore_index=True)
     if (again := rows.duplicated([*KEYS, *rows.columns.intersection(["machine"])])).any():
         twice = rows[again].iloc[0]
@@ -67,22 +64,6 @@ def study(paths: Sequence[Path]) -> pd.DataFrame:
             f"expected every run once, got {twice['method']} with seed {twice['seed']} of {twice['scene']} twice"
         )
     return rows
-
-
-def _stored(path: Path) -> pd.DataFrame:
-    """The rows of a table FILE.  Raises InputError where a column is missing or has other than numbers."""
-    try:
-        table = pd.read_csv(path, dtype=dict.fromkeys(TEXTS, str), keep_default_na=False, na_values=[""])
-    except (ValueError, OverflowError) as error:  # pandas names no file
-        raise InputError(f"expected the table of a study in {path}, got {error}") from None
-    if missing := [key for key in KEYS if key not in table]:
-        raise InputError(f"expected the table of a study in {path}, got one without the column {missing[0]}")
-    for name in table.columns.difference(TEXTS):
-        numbers = pd.Series(pd.to_numeric(table[name], errors="coerce"))
-        if wrong := list(table[name][numbers.isna() & (table[name].notna() | (name in KEYS))]):
-            raise InputError(f"expected numbers as {name} in {path}, got {reprlib.repr(wrong[0])}")
-        table[name] = numbers
-    return table
 
 
 def _runs(path: Path) -> list[Path]:
