@@ -13,9 +13,7 @@ from splat.training.state import TrainConfig, Training
 
 FEW = 500  # Gaussians at the start; density control adds others near those that are there, so that places without stay empty
 NAMED = 12  # views in the first line
-NARROW = (
-    0.02  # of an image's width: sigma of the smallest Gaussians that are removed for their size, below which it is said
-)
+NARROW = 0.02  # of an image's width: where Gaussians with a smaller sigma are removed for their size, it is said
 HOW_IT_STARTS: dict[Source, str] = {
     "points": "the scene's points",
     "triangulated": "points triangulated in the training views",

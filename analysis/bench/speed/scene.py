@@ -22,7 +22,7 @@ Wholes:
     compositing         forward and backward + reduce
     rasterizer          bin to forward, slots, backward + reduce
     gradient            every stage
-    gradient, autograd  the same through the graph of torch, as the loss of a probed viewpoint has it
+    gradient, autograd  the same through the graph of torch, as a function of one's own takes it
     gradient, atomic    ... with sums by atomic additions (on a GPU)
     gsplat              ... by that package's kernels (on a GPU)
     linearize           what `LinearizedView` does once

@@ -14,10 +14,7 @@ from torch import Tensor
 
 from splat.backend.cpu.threads import over_batch
 
-TOLERANCE = {
-    torch.float32: 1e-5,
-    torch.float64: 1e-11,
-}  # bound of rounding errors, relative to the largest singular value
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # rounding errors, relative to the largest singular value
 CHUNK = 4096  # Gaussians at a time
 WIDEST = 32  # most rows and columns of matrices that CUDA decomposes in a batch; larger ones it takes one by one
 

@@ -27,6 +27,7 @@ from splat.losses.cpu.window import (
     blur_down_three,
     bordered_rows,
     clear,
+    clear_padding,
     counts,
     leave_margin,
     moments_along,
@@ -141,8 +142,7 @@ def finish_gradient(x, y, at, row, frame, slopes, loss, gradient, blurred_sp, va
                     store(blurred_sp, at + i, bp)
             store(gradient, at + i, slope)
     if gradient is not None:
-        for i in range(frame.width, frame.stride):
-            gradient[at + i] = 0
+        clear_padding(gradient, at, frame)
     return row_sum(values, frame.width)
 
 
@@ -196,8 +196,8 @@ def finish_pair(x, y, at, row, frame, slopes, loss, in_x, in_y, values):
             store(in_x, at + i, one_bar)
             store(in_y, at + i, other_bar)
     if in_x is not None:
-        for i in range(frame.width, frame.stride):
-            in_x[at + i] = in_y[at + i] = 0
+        clear_padding(in_x, at, frame)
+        clear_padding(in_y, at, frame)
     return row_sum(values, frame.width)
 
 
@@ -272,8 +272,7 @@ def finish_product(v, mean, x, y, at, row, field, frame, slopes, loss, blurred_s
             total -= loss.structural * (ssim_adjoint(residual, aim - CENTRE, bm, bp, bq) + turned)
             total += mean * load(uniform, at + i)
         store(product, at + i, total)
-    for i in range(frame.width, frame.stride):
-        product[at + i] = 0
+    clear_padding(product, at, frame)
 
 
 @formula
@@ -363,8 +362,7 @@ def uniform_rows(start, stop, frame, loss, x, y, target, columns, lines, uniform
                 total = pixel_curvature(residual, loss.kind, loss.eps, broadcast(x, loss.pixel))
                 bm, bp, bq = blur_down_three(slopes, 0, row, i, frame)
                 store(uniform, at + i, total - loss.structural * ssim_adjoint(residual, aim - CENTRE, bm, bp, bq))
-            for i in range(frame.width, frame.stride):
-                uniform[at + i] = 0
+            clear_padding(uniform, at, frame)
 
 
 @kernel
@@ -394,8 +392,7 @@ def diagonal_rows(start, stop, frame, loss, x, y, blurred_sp, seconds, squared, 
                     own = mm, mp, mq, blur_down(bends, 3, row, i, squared), blur_down(bends, 4, row, i, squared)
                     total -= loss.structural * ssim_diag_hessian(own, load(blurred_sp, at + i), residual, aim)
                 store(diagonal, at + i, total)
-            for i in range(frame.width, frame.stride):
-                diagonal[at + i] = 0
+            clear_padding(diagonal, at, frame)
 
 
 @kernel
@@ -410,5 +407,4 @@ def uncoupled_rows(start, stop, frame, loss, x, y, blurred_sp, uncoupled):
                     load(x, at + i) - load(y, at + i), loss.kind, loss.eps, broadcast(x, loss.pixel)
                 )
                 store(uncoupled, at + i, curvature - 2.0 * loss.structural * load(blurred_sp, at + i))
-            for i in range(frame.width, frame.stride):
-                uncoupled[at + i] = 0
+            clear_padding(uncoupled, at, frame)

@@ -65,6 +65,13 @@ def clear(ring, first, fields, y, frame):
 
 
 @formula
+def clear_padding(plane, at, frame):
+    """The row of a plane that begins at `at` is 0 behind the image."""
+    for i in range(frame.width, frame.stride):
+        plane[at + i] = 0
+
+
+@formula
 def put(rows, i, frame, numbers):
     """Numbers at column i of as many bordered rows."""
     for field in range(len(numbers)):

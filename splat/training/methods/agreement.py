@@ -38,8 +38,8 @@ def agreement_gradients(
     loss = loss_between(first.crop(first.planes)[:3], settings or step.config.loss)
     _, cotangents = loss.consistency(first.planes[:3], second.planes[:3])
     of_alpha = torch.zeros_like(first.planes[3:])
-    each = [
-        view.pull_back(torch.cat([weight * cotangent, of_alpha]))[0]
-        for view, cotangent in zip(passes, cotangents, strict=True)
-    ]
-    return each[0], each[1]
+    in_first, in_second = (
+        each.pull_back(torch.cat([weight * cotangent, of_alpha]))[0]
+        for each, cotangent in zip(passes, cotangents, strict=True)
+    )
+    return in_first, in_second

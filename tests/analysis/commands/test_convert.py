@@ -104,9 +104,7 @@ def test_a_short_training_of_trained_gaussians_adds_none_unless_asked_to(folder,
     assert main([*common, *changes, "--out", str(folder / "short")]) == 0
     count = len(load_checkpoint(folder / "short" / "checkpoint.pt").training.gaussians)
     assert (count > len(MADE.truth)) == grows and count >= 0.9 * len(MADE.truth)
-    assert (
-        "schedule is scaled" not in capsys.readouterr().err
-    )  # nothing is: 3DGS has no schedule of a length of its own
+    assert "schedule is scaled" not in capsys.readouterr().err  # 3DGS has none of a length of its own
 
 
 SAID = "the file cannot say how it was rendered"
