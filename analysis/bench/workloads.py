@@ -17,11 +17,8 @@ from splat.scenes.scene import load_scene
 from splat.scenes.splits import split_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.view import View
-from splat.scenes.write import write_transforms_scene
-from splat.training.checkpoint import load_checkpoint, save_checkpoint
-from splat.training.origin.scene_reference import SceneReference
+from splat.training.checkpoint import load_checkpoint
 from splat.training.start import gaussians_from_points
-from splat.training.state import TrainConfig, Training
 
 
 @dataclass(frozen=True)
@@ -86,18 +83,6 @@ def synthetic_workload(size: Size) -> Workload:
     """Four views of the synthetic scene, whose Gaussians have lost their exact colours, so that the loss is not at 0."""
     made = synthetic_scene(SyntheticSettings(size.count, 4, size.width, size.height, sh_degree=3))
     return Workload(f"synthetic {size}", _discoloured(made.truth), tuple(made.scene.load()), made.scene.background)
-
-
-def synthetic_checkpoint(settings: SyntheticSettings, folder: Path) -> Path:
-    """The scene in a folder, and a checkpoint of a training on all its views that begins at its discoloured Gaussians."""
-    made, path = synthetic_scene(settings), folder / "run" / "checkpoint.pt"
-    write_transforms_scene(made.scene, folder / "scene")
-    scene = load_scene(folder / "scene")
-    split = split_scene(scene, train=scene.names)
-    training = Training.start(_discoloured(made.truth), scene.extent(split.train), TrainConfig(sh_degree=3))
-    path.parent.mkdir()
-    save_checkpoint(path, training, SceneReference.to(scene, path, split, None, 1.0))
-    return path
 
 
 def _discoloured(gaussians: Gaussians) -> Gaussians:

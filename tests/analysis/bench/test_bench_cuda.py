@@ -18,9 +18,17 @@ from analysis.bench.speed.meters import HostMeter
 from analysis.bench.speed.peer import MissingPeer, gsplat_gradient
 from analysis.bench.speed.scene import BYTES, ViewBench
 from analysis.bench.speed.timing import Timing
+from analysis.bench.workloads import Workload
 from splat.losses.autograd import loss_against
-from tests.analysis.bench.test_gpu_check import toy
-from tests.splat.random_scenes import relative_error
+from splat.losses.reference import LossSettings
+from tests.splat.held_scenes import two_views
+from tests.splat.random_scenes import random_gaussians, relative_error
+
+
+def toy() -> Workload:
+    """For a machine without a GPU: one tile, and a loss without SSIM."""
+    gaussians = random_gaussians(4, 0, logit=1.0, spread=0.4).to(torch.float32)
+    return Workload("toy", gaussians, tuple(two_views(16, 12)[:1]), torch.zeros(3), LossSettings("charbonnier", 0.0))
 
 
 class StillClock(HostMeter):

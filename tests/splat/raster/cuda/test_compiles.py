@@ -31,7 +31,7 @@ def kernels() -> list[tuple]:
     from splat.raster.cuda.raster import BLOCK, LAUNCH, ROWS, SIDE_BY_SIDE, TILE, TOGETHER
     from splat.raster.formulas import SPLAT
 
-    single, double = types("fp32"), types("fp64")  # the latter for a probe's own check and `analysis.bench.gpu_check`
+    single, double = types("fp32"), types("fp64")  # the latter for a probe's own check
     tiled, blocked = LAUNCH["num_warps"], {"BLOCK": BLOCK}
     strips = {"BLOCK": cuda_binning.BLOCK, "WIDTH": cuda_binning.WIDTH}
     summed = {"WIDTH": SPLAT, "PADDED": 16, "TOGETHER": SIDE_BY_SIDE // 16, "BLOCK": ROWS}
