@@ -1,4 +1,4 @@
-"""Render a height field off-screen with PyVista: `python render_surface.py FIELD.npz OUT.png`.
+"""Render a height field off-screen with PyVista: `python -m figures.render_surface FIELD.npz OUT.png`.
 
 A program of its own: where a machine has no usable OpenGL, VTK may end the process that renders.  FIELD.npz holds
 `height` [nx, ny] in [0, 1], nan where there is none, `dots` [nx, ny], the points to mark, `colour` [256, 3] as bytes, and

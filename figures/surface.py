@@ -6,7 +6,6 @@ picture, which is then matplotlib's.
 """
 
 import subprocess
-import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
@@ -23,10 +22,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.ticker import MaxNLocator
 
+from analysis.console.drawing import own_python
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
-from figures import render_surface
 from figures.plane import Direction, Plane, plane
 from figures.render_surface import Box
 from figures.scripts import script
@@ -34,7 +33,7 @@ from figures.style import BLACK, FIELD_MAP, VERMILION, new_figure, style
 from landscape.errors import InputError
 from landscape.slices.eye import eye_over
 
-RENDERER = [sys.executable, str(Path(render_surface.__file__))]
+RENDERER = "figures.render_surface"
 TIME_LIMIT = 120  # seconds for one picture
 LEVELS = 10
 SAME = 0.005  # relative difference of two scales that look alike
@@ -105,7 +104,7 @@ def _rendered(box: Box, heights: np.ndarray, levels: np.ndarray, dots: np.ndarra
         np.savez(field, height=heights, colour=colour, levels=levels, dots=dots, eye=box.eye)
         try:
             done = subprocess.run(
-                [*RENDERER, str(field), str(out)], capture_output=True, text=True, timeout=TIME_LIMIT, check=False
+                **own_python(RENDERER, field, out), capture_output=True, text=True, timeout=TIME_LIMIT, check=False
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             raise RuntimeError(str(error)) from None

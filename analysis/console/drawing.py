@@ -5,13 +5,16 @@ renderer that ends its process (VTK does, where OpenGL is missing) cannot take a
 ends a process that draws before any that measures.
 """
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 FIRST_TO_END = "1000"  # of /proc/PID/oom_score_adj
@@ -22,15 +25,13 @@ Draw = Callable[[Path], list[str]]
 @contextmanager
 def drawing(module: str) -> Iterator[Draw]:
     """`python -m figures.MODULE` of a folder that is named later: the process loads its libraries meanwhile."""
-    command = [sys.executable, "-m", f"figures.{module}", "-"]  # without a folder there is nothing to draw
-    with _group(command) as process:
-        yield lambda target: _said(process, str(target))
+    with _group(f"figures.{module}", "-") as process:  # without a folder there is nothing to draw
+        yield lambda target: _said(process, str(target.resolve()))
 
 
 def draw(module: str, target: Path) -> list[str]:
     """Run `python -m figures.MODULE TARGET`, a folder or a file; as `Draw` does."""
-    command = [sys.executable, "-m", f"figures.{module}", str(target)]
-    with _group(command) as process:
+    with _group(f"figures.{module}", target.resolve()) as process:
         return _said(process)
 
 
@@ -43,15 +44,18 @@ def draw_or_say(module: str, target: Path) -> list[str]:
 
 
 @contextmanager
-def _group(command: list[str]) -> Iterator[subprocess.Popen[str]]:
-    """A process that ends with the block, and with it those that it has started: they would keep its output open for ever."""
+def _group(module: str, *words: str | Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that ends with the block, and with it those that it has started: they would keep its output open for ever.
+
+    It runs in the folder of the code: matplotlib reads a `matplotlibrc` of the current folder.
+    """
     process = subprocess.Popen(
-        command,
+        **own_python(module, *words),
+        cwd=ROOT,
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-        env=module_environment(),
         start_new_session=True,
     )
     try:
@@ -80,6 +84,17 @@ def _said(process: subprocess.Popen[str], told: str = "") -> list[str]:
     return [line.split("Warning: ", 1)[1] for line in lines if "Warning: " in line]
 
 
-def module_environment() -> dict[str, str]:
-    """Environment in which `python -m` finds this repository's modules, and all that this process finds."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+def own_python(module: str, *words: object, **environment: str) -> dict[str, Any]:
+    """Arguments of `subprocess` for `python -m MODULE WORDS`: every Python that this program starts.
+
+    It imports this program and what is installed, nothing from the current folder, which may be a stranger's scene.
+    environment: added to that of this process.
+    """
+    command = [sys.executable, "-P", "-m", module, *map(str, words)]
+    return {"args": command, "env": {**os.environ, "PYTHONPATH": str(ROOT), **environment}}
+
+
+def own_pool() -> ProcessPoolExecutor:
+    """A process that runs functions of this program, begun anew as `own_python` is."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # as -P, in all that is started from here on
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from PIL import Image
 
-from analysis.console.drawing import module_environment
+from analysis.console.drawing import own_python
 from analysis.records.quantities import exponent_of
 from figures import make_all, slice2d, spectrum, surface, traces
 from figures.plane import plane
@@ -262,7 +262,9 @@ def test_a_slice_without_a_finite_point_is_refused(tmp_path):
 
 def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypatch):
     record = written(tmp_path / "probe", *synthetic())
-    monkeypatch.setattr(surface, "RENDERER", [sys.executable, "-c", "import sys; sys.exit('no OpenGL here')"])
+    (tmp_path / "broken.py").write_text("raise SystemExit('no OpenGL here')")
+    monkeypatch.setattr("analysis.console.drawing.ROOT", tmp_path)
+    monkeypatch.setattr(surface, "RENDERER", "broken")
     with pytest.warns(surface.RendererMissing, match="no OpenGL here"):
         figure = surface.draw(record)
     assert "without the off-screen renderer" in figure.get_supxlabel()
@@ -270,9 +272,9 @@ def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypat
 
 def test_the_command_draws_the_folder_named_on_its_standard_input(tmp_path):
     folder = written(tmp_path / "probe", *synthetic()).folder
-    command = [sys.executable, "-m", "figures.make_all", "--without", "surface", "--without", "slice2d", "-"]
+    command = own_python("figures.make_all", "--without", "surface", "--without", "slice2d", "-")
     for said, names in (("", []), (str(folder), ["spectrum.png", "traces.png"])):
-        done = subprocess.run(command, input=said, capture_output=True, text=True, env=module_environment(), check=True)
+        done = subprocess.run(**command, input=said, capture_output=True, text=True, check=True)
         assert done.stderr == "" and sorted(path.name for path in folder.glob("*.png")) == names
     by_processes = {path.name: path.read_bytes() for path in folder.glob("*.png")}
     alone = make_all.draw_probe(folder, without=["surface", "slice2d"])  # by this process

@@ -1,10 +1,8 @@
 """Double backward through the torch reference renderer, for comparison: in a process of its own, whose memory is its own."""
 
-import multiprocessing
 import resource
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import torch
 
 from analysis.bench.speed.meters import GpuMeter
 from analysis.bench.workloads import Workload
+from analysis.console.drawing import own_pool
 from splat.losses.reference import photometric_loss
 from splat.render.render import render
 
@@ -29,7 +28,7 @@ class ReferenceCost:
 def reference_cost(workload: Workload) -> ReferenceCost:
     """One gradient and one H v of the first view, where its Gaussians are, with as many threads as here."""
     alone = replace(workload, views=workload.views[:1]).to(torch.device("cpu"))  # a GPU's memory is not passed on
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with own_pool() as pool:
         return pool.submit(_measure, alone, workload.gaussians.flat.device, torch.get_num_threads()).result()
 
 

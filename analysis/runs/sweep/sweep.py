@@ -14,7 +14,6 @@ threads, only the seconds do.
 import os
 import shlex
 import subprocess
-import sys
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import replace
@@ -25,7 +24,7 @@ from time import monotonic
 import pandas as pd
 from rich.console import Console
 
-from analysis.console.drawing import module_environment
+from analysis.console.drawing import own_python
 from analysis.console.interruption import interruption
 from analysis.console.plain import say
 from analysis.probe.options import ProbeOptions
@@ -195,11 +194,10 @@ class _Cells:
         with log_of(cell).open("ab", buffering=0) as log:
             log.write(f"$ {shlex.join(['landscape', *words])}\n".encode())
             process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "analysis.commands.cli", *words],
+                **own_python("analysis.commands.cli", *words, **_threads(self.jobs)),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=_environment(self.jobs),
                 pass_fds=(lock,),
                 start_new_session=True,  # the terminal's Ctrl-C comes here alone, and is passed on once
             )
@@ -222,14 +220,11 @@ def lock_of(cell: Cell) -> Path:
     return cell.out.with_name(f".{cell.out.name}.cell")
 
 
-def _environment(jobs: int) -> dict[str, str]:
-    """Environment of a command: its share of the processors, or of the threads that this process was given."""
-    environment = module_environment()
-    if jobs > 1:
-        given = os.environ.get("OMP_NUM_THREADS", "")
-        share = max(1, (int(given) if given.isdigit() else usable_cores()) // jobs)
-        environment |= dict.fromkeys(THREADS, str(share))
-    return environment
+def _threads(jobs: int) -> dict[str, str]:
+    """Environment of one of so many commands: its share of the processors, or of the threads that this process was given."""
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    share = max(1, (int(given) if given.isdigit() else usable_cores()) // jobs)
+    return dict.fromkeys(THREADS, str(share)) if jobs > 1 else {}
 
 
 def _conclude(cells: _Cells, stopped: int) -> int:

@@ -1,11 +1,14 @@
 """Pictures drawn by other processes."""
 
+import ast
 from pathlib import Path
 from time import monotonic
 
 import pytest
 
-from analysis.console.drawing import draw, drawing
+from analysis.console.drawing import ROOT, draw, drawing, own_pool
+from figures.make_all import FIGURES
+from tests.recorded import synthetic, written
 
 STUCK = """
 import subprocess, sys
@@ -15,10 +18,10 @@ subprocess.run([sys.executable, "-c", "import time; print('asleep', file=open('a
 
 @pytest.fixture
 def figures(tmp_path, monkeypatch):
-    """A package `figures` where `python -m` looks first."""
+    """A package `figures` in place of this program's own."""
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "__init__.py").touch()
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("analysis.console.drawing.ROOT", tmp_path)
     return tmp_path / "figures"
 
 
@@ -53,3 +56,43 @@ def test_where_memory_runs_out_drawing_ends_before_measuring(figures):
 def test_a_drawing_that_the_system_ends_says_why(figures):
     (figures / "ended.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)")
     assert draw("ended", figures) == ["drawing failed: ended by SIGKILL, as Linux does where memory runs out"]
+
+
+def test_nothing_beside_a_scene_is_run_or_read_by_what_draws(tmp_path, monkeypatch):
+    """Packages and modules, of names that are drawn with, and settings of matplotlib that ask for a program."""
+    folder, marks = written(tmp_path / "probe", *synthetic()).folder, tmp_path / "ran"
+    theirs = f"import os\nos.makedirs({str(marks)!r}, exist_ok=True)\nopen({str(marks)!r} + '/' + __name__, 'w')\n"
+    for name in ("figures", "analysis", "pyvista", "PIL"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(theirs)
+    for name in ("matplotlib", "random", "numpy", "sitecustomize", "figures/make_all", "render_surface", "traces"):
+        (tmp_path / f"{name}.py").write_text(theirs)
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nbackend: module://traces\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", "")
+    monkeypatch.syspath_prepend("")  # as `python -m` has it
+    said = draw("make_all", Path("probe"))
+    assert not marks.exists(), sorted(path.name for path in marks.iterdir())
+    assert {path.stem for path in folder.glob("*.png")} == {*FIGURES} - {"slice1d"}, said
+
+
+def test_nor_by_a_process_that_is_begun_anew(tmp_path, monkeypatch):
+    (tmp_path / "multiprocessing.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONSAFEPATH", "")
+    with own_pool() as pool:
+        assert pool.submit(abs, -3).result() == 3
+    assert not (tmp_path / "ran").exists()
+
+
+def test_every_python_is_started_by_one_function():
+    """Who names the interpreter runs it without `-P`, and with what the current folder brings."""
+    found = [
+        path
+        for layer in ("landscape", "splat", "analysis", "figures")
+        for path in (ROOT / layer).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if (isinstance(node, ast.Attribute) and ast.unparse(node) in ("sys.executable", "os.system", "os.popen"))
+        or (isinstance(node, ast.alias) and node.name.split(".")[0] in ("multiprocessing", "runpy", "pty"))
+    ]
+    assert {*found} == {ROOT / "analysis/console/drawing.py"}
