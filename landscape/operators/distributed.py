@@ -177,6 +177,6 @@ class DistributedOperator:
         self.dim, self.dtype, self.blocks = local.dim, local.dtype, local.blocks
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         self.ranks.require_same_vectors(V)
         return self.ranks.sum(self.local.apply(V))

@@ -41,16 +41,19 @@ class SymmetricOperator(Protocol):
     def dtype(self) -> torch.dtype: ...
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        """H V.  The next call may overwrite it.  Raises ValueError unless V has the shape (dim, k)."""
+        """H V.  The next call may overwrite it.  Raises ValueError unless V has the shape (dim, k) and the dtype."""
         ...
 
 
-def require_vectors(V: Tensor, n: int) -> None:
-    """Raise ValueError unless V is (n, k)."""
+def require_vectors(V: Tensor, n: int, dtype: torch.dtype, device: torch.device | None = None) -> None:
+    """Raise ValueError unless V is (n, k), of the operator's dtype and, where one is named, on its device."""
     if V.ndim == 1 and V.shape[0] == n:
         raise ValueError(f"expected V of shape (n, k) with n = {n}, got ({n},); use V[:, None]")
     if V.ndim != 2 or V.shape[0] != n:
         raise ValueError(f"expected V of shape (n, k) with n = {n}, got {tuple(V.shape)}")
+    if V.dtype != dtype or (device is not None and V.device != device):
+        where = "" if device is None else f" on {device}"
+        raise ValueError(f"expected V of {dtype}{where}, got {V.dtype} on {V.device}; use V.to(...)")
 
 
 def product(operator: SymmetricOperator, V: Float[Tensor, "n k"], finite: bool = True) -> Float[Tensor, "n k"]:
@@ -136,7 +139,7 @@ class DenseOperator:
         self.blocks = require_blocks({"all": slice(0, self.dim)} if blocks is None else blocks, self.dim)
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype, self.matrix.device)
         return self.matrix @ V
 
 
@@ -160,7 +163,7 @@ class SumOperator:
         self.dim, self.dtype, self.blocks = first.dim, first.dtype, first.blocks
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         total = self.weights[0] * self.terms[0].apply(V)
         for weight, term in zip(self.weights[1:], self.terms[1:], strict=True):
             total.add_(term.apply(V), alpha=weight)
@@ -185,7 +188,7 @@ class RestrictedOperator:
         self.blocks = {block: slice(0, self.dim)}
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         padded = V.new_zeros(self.inner.dim, V.shape[1])
         padded[self.rows] = V
         return self.inner.apply(padded)[self.rows]
@@ -202,7 +205,7 @@ class ScaledOperator:
         self.dim, self.dtype, self.blocks = inner.dim, inner.dtype, inner.blocks
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         return self.scale * self.inner.apply(self.scale * V)
 
 
@@ -217,7 +220,7 @@ class ProjectedOperator:
         self.dim, self.dtype, self.blocks = inner.dim, inner.dtype, inner.blocks
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         return self.project(self.inner.apply(self.project(V)))
 
 
@@ -233,7 +236,7 @@ class CountingOperator:
         self.matvecs, self.calls, self.seconds = 0, 0, 0.0
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(finished(V), self.dim)
+        require_vectors(finished(V), self.dim, self.dtype)
         start = perf_counter()
         result = finished(self.inner.apply(V))
         self.seconds += perf_counter() - start

@@ -38,7 +38,7 @@ class ViewSum:
         self.spared = 0
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         parts = [part.contiguous() for part in V.split(VECTORS, dim=1)]
         totals = [torch.zeros_like(part, dtype=self.dtype) for part in parts]
         for view in islice(self.objective.linearized, self.count):
@@ -106,7 +106,7 @@ class SceneHessian:
         return V if self.keep_null else self.projector.apply(V)
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         self.objective.ranks.require_same_vectors(V)
         PV = self._argument(V)
         total = self._recordings(self.views.apply, PV) if self.recordable(V.shape[1]) else self.views.apply(PV)

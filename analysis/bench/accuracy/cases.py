@@ -122,7 +122,7 @@ class MeteredOperator:
         self.matvecs, self.seconds, self.spent = 0.0, 0.0, 0.0
 
     def apply(self, V: Tensor) -> Tensor:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         start = perf_counter()
         result = _product(self.inner, V)
         spent = perf_counter() - start
