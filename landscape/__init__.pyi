@@ -24,6 +24,8 @@ from .operators.operator import RestrictedOperator as RestrictedOperator
 from .operators.operator import ScaledOperator as ScaledOperator
 from .operators.operator import SumOperator as SumOperator
 from .operators.operator import SymmetricOperator as SymmetricOperator
+from .operators.renderer.renderer import ProductErrors as ProductErrors
+from .operators.renderer.renderer import RendererHessian as RendererHessian
 from .results import Bracket as Bracket
 from .results import Progress as Progress
 from .results import StopReason as StopReason
