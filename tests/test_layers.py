@@ -20,7 +20,7 @@ METHODS = "splat.training.methods.methods"  # its example is in the docstring of
 ORDER = {
     "": "landscape splat analysis figures",
     "landscape": "errors linalg probes results operators traces eigen spectrum slices",
-    "splat": "model backend projection losses raster render scenes curvature training",
+    "splat": "model backend projection losses render gpu scenes curvature training",
     "analysis": "records console measures train probe slice runs bench commands",
 }
 
@@ -102,20 +102,22 @@ def test_circles_are_found():
     assert not circles({("a", "b"), ("b", "c"), ("a", "c")})
 
 
-@pytest.mark.parametrize(("one", "other"), [("cpu", "cuda"), ("cuda", "cpu")])
-def test_the_kernels_of_one_device_import_nothing_of_the_other(one, other):
-    of_one = [
-        name
-        for name in modules()
-        if name.startswith("splat.") and any(part.startswith(one) for part in name.split(".")[2:])
-    ]
-    of_one = [name for name in of_one if not name.startswith("splat.backend.")]
-    assert len(of_one) > 4
-    for name in of_one:
-        others = [
-            part for each in sources(name) for part in each.split(".")[2:] if not each.startswith("splat.backend.")
-        ]
-        assert not [part for part in others if part.startswith(other) or part.endswith(f"_{other}")], name
+def test_all_triton_is_in_one_wing_which_one_line_names():
+    naming = []
+    for name, path in modules().items():
+        wing = name.startswith("splat.gpu")
+        roots = {each.split(".")[0] for each in imported(path)}
+        assert wing or "triton" not in roots, name
+        assert wing or not any(each.startswith("splat.gpu") for each in sources(name)), name
+        lines = path.read_text(encoding="utf-8").splitlines()
+        naming += [name for line in lines if not wing and "splat.gpu" in line]
+    assert naming == ["splat.backend.device"]
+
+
+def test_the_gpus_kernels_import_none_of_the_cpus():
+    for name in (each for each in modules() if each.startswith("splat.gpu.")):
+        others = {each for each in sources(name) if not each.startswith("splat.backend.")}
+        assert not {each for each in others if ".cpu" in each or each.endswith("_cpu")}, name
 
 
 def test_what_is_imported_as_a_module_loads_is_a_dependency():

@@ -40,7 +40,8 @@ from analysis.records.provenance import machine
 from landscape.errors import InputError
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import thread_count
-from splat.backend.device import by_triton, device_named
+from splat.backend.device import device_named
+from splat.render.backend import CPU, backend_of
 
 SIZES = ("10k@504x378", "100k@504x378")
 LARGEST = "500k@1600x1060"
@@ -198,7 +199,7 @@ def _scaling(workload: Workload, repetitions: int, meter: Meter) -> list[dict]:
 
 def _roofline(bench: ViewBench, times: dict[str, Timing], peak: float, bandwidth: float) -> Table:
     """Table of the pairs a second that the passes evaluate, and of their arithmetic and bytes as shares of the ceilings."""
-    pairs = bench.pairs
+    pairs = bench.raster.pairs
     table = pd.DataFrame(
         {
             "pass": name,
@@ -216,7 +217,7 @@ def _bounds(
     workload: Workload, bench: ViewBench, times: dict[str, Timing], reference: ReferenceCost | None, meter: Meter
 ) -> pd.DataFrame:
     """Ratios that the project promises: of times, and of bytes over what the view's size allows."""
-    view, lines = bench.linearized, ratios(times, by_triton(workload.gaussians.flat))
+    view, lines = bench.linearized, ratios(times, backend_of(workload.gaussians.flat) is not CPU)
     kept, sizes = bench.kept(), (view.touched, workload.pixels, view.intersections)
     allowed = sum(each * size for each, size in zip(KEPT, sizes, strict=True))
     lines.append(_line(f"kept linearisation ({kept / 1e6:.1f} MB) / allowance", kept / allowed, 1.0))

@@ -22,12 +22,11 @@ from torch import Tensor
 
 from analysis.bench.workloads import Workload
 from splat.curvature.linearize import LinearizedView
-from splat.losses.autograd import loss_against
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.projection.dispatch import projected
 from splat.projection.formulas import lens_of
-from splat.raster.cpu.binning import depth_order
+from splat.render.backend import backend_of
+from splat.render.cpu.binning import depth_order
 from splat.render.forward import rasterize_view
 from splat.scenes.view import View
 
@@ -62,7 +61,7 @@ def same_decisions(gaussians: Gaussians, view: View, settings: RenderSettings) -
     """The Gaussians with the same place in the order of depth, drawn, and with the same colour clamps in either precision."""
     found = []
     for dtype in (torch.float32, torch.float64):
-        there = projected(gaussians.to(dtype), lens_of(view.camera, settings))
+        there = backend_of(gaussians.flat).project(gaussians.to(dtype), lens_of(view.camera, settings))
         splats, depths, drawn = (tensor.cpu().numpy() for tensor in there)
         order = depth_order(depths, drawn)
         place = np.full(len(drawn), -1)
@@ -106,7 +105,7 @@ def _derivatives(
     gaussians: Gaussians, view: View, workload: Workload, settings: RenderSettings, U: Tensor
 ) -> dict[str, Any]:
     flat = gaussians.flat
-    loss = loss_against(view.image, workload.loss, flat)
+    loss = backend_of(flat).view_loss(view.image, workload.loss, flat)
     held = LinearizedView(gaussians, view.camera, loss, workload.background.to(flat), settings)
     diagonals = held.block_diagonal(approximate=True).diagonals
     traces = {name: (float(part.sum()), float(part.abs().sum())) for name, part in diagonals.items()}

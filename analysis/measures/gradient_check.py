@@ -30,12 +30,13 @@ from landscape.operators.checks import ROUND_OFFS
 from landscape.results import Progress
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
-from splat.losses.autograd import loss_against, view_loss
+from splat.losses.autograd import view_loss
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.reference import Splats, project
 from splat.render.autograd import project_by_kernel, rasterize_by_kernel
+from splat.render.backend import backend_of
 
 STEPS = (1e-10, 3e-11, 1e-11, 3e-12)  # per parameter; means in units of their spread
 MOST_MOVED = 5e-4  # sum of a step over all parameters: longer ones cross jumps, which the last two STEPS may
@@ -108,7 +109,7 @@ def _gradient(
     active, settings = objective.active, objective.settings
     double, background = active.to(torch.float64), objective.background.double()
     shown = objective.views[:views]
-    losses = [loss_against(view.image, objective.loss_settings, double.flat) for view in shown]
+    losses = [backend_of(double.flat).view_loss(view.image, objective.loss_settings, double.flat) for view in shown]
     depths = [project_by_kernel(active, view.camera, settings).depths.double() for view in shown]
     done = 0
 

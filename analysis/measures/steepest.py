@@ -26,9 +26,9 @@ from landscape import curvature_reach
 from splat.backend.cpu.threads import single_threaded, thread_count
 from splat.curvature.fields import Values
 from splat.curvature.objective import SceneObjective
-from splat.projection.dispatch import projected
 from splat.projection.formulas import lens_of
 from splat.projection.reference import NEEDLE
+from splat.render.backend import backend_of
 from splat.render.render import render
 from splat.render.sight import Sight, sight
 from splat.scenes.view import View
@@ -154,7 +154,7 @@ def _carrier(
     active, index = objective.active, torch.tensor([i])
     part = active.with_flat(end.vector).select(index)
     shares = mass_shares(part.flat, part.blocks)
-    splats, _, _ = projected(active.select(index), lens_of(view.camera, objective.settings))
+    splats, _, _ = backend_of(active.flat).project(active.select(index), lens_of(view.camera, objective.settings))
     outline = outline_of(splats[0].double())
     return Carrier(
         gaussian=int(objective.mask.nonzero()[i, 0]),

@@ -60,12 +60,12 @@ from landscape.slices.refinement import SliceSettings
 from landscape.spectrum.density import ActiveSpace
 from landscape.traces.trace import TraceSettings, total_trace
 from splat.backend.cpu.threads import single_threaded, thread_count
-from splat.backend.device import by_triton
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.shares import BlockShare, block_shares
 from splat.curvature.traces import block_traces, exact_traces
+from splat.render.backend import CPU, backend_of
 
 STAGES = ("traces", "eigenvalues", "slice", "density", "power iteration", "finite probe", "depth", "block shares")
 LEFT_OUT = {  # notes on stages that the settings exclude
@@ -137,7 +137,7 @@ def _linearised(objective: SceneObjective, settings: ProbeSettings, report: Prog
 
 def _compile_blocks(objective: SceneObjective) -> None:
     """Compile the kernel of exact blocks, on one Gaussian, so that the stages that use it take the expected time."""
-    if objective.couples_pixels and not by_triton(objective.active.flat):
+    if objective.couples_pixels and backend_of(objective.active.flat).exact_blocks:
         one = objective.active.select(torch.zeros(1, dtype=torch.int64))
         objective.linearizer(one)(0).block_diagonals(approximate=False, parts=(False, True))
 
@@ -200,7 +200,7 @@ def _traces(
 ) -> dict[str, TraceEstimate]:
     """Traces at their accuracy; on a CPU, those that need more than MOST_SAMPLES samples are summed over exact blocks."""
     allowed, samples = replace(at.settings.traces, max_seconds=kept.left), at.settings.trace_samples
-    if samples or by_triton(at.objective.active.flat):
+    if samples or not backend_of(at.objective.active.flat).exact_blocks:
         return exact_traces(at.objective, generator, allowed, report, samples=samples)
     few = replace(allowed, max_probes=min(allowed.max_probes, MOST_SAMPLES))
     found = exact_traces(at.objective, generator, few, report)
@@ -282,7 +282,7 @@ def _plane(
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
-    workers = 1 if at.objective.ranks.size > 1 or by_triton(center) else thread_count()
+    workers = thread_count() if at.objective.ranks.size == 1 and backend_of(center) is CPU else 1
     most = inf if settings.slice_plane else 1  # 1: the two axes alone
     accuracy = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most)
     # E^T H E of Ritz vectors E is diagonal: no product is needed

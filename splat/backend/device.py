@@ -7,11 +7,11 @@ one machine each has a GPU of its own.
 
 import os
 from collections.abc import Mapping
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Literal
 
 import torch
-from torch import Tensor
 
 from landscape.errors import InputError
 
@@ -26,7 +26,10 @@ def device_named(name: Literal["auto", "cpu", "cuda"]) -> torch.device:
     lack = _lack() or too_few(os.environ, torch.cuda.device_count())
     if name == "cuda" and lack:
         raise InputError(f"expected an NVIDIA GPU for the device cuda, got {lack}, or use the device cpu")
-    return torch.device("cpu") if lack else torch.device("cuda", place(os.environ))
+    if lack:
+        return torch.device("cpu")
+    import_module("splat.gpu")  # registers its kernels; the one place that names it
+    return torch.device("cuda", place(os.environ))
 
 
 def place(environment: Mapping[str, str]) -> int:
@@ -61,11 +64,3 @@ def _lack() -> str | None:
     if find_spec("triton") is None:
         return "no triton to compile its kernels; pip install -e '.[gpu]'"
     return None
-
-
-EMULATED = False  # tests of the Triton kernels without a GPU set this: then they take tensors on the CPU, too
-
-
-def by_triton(tensor: Tensor) -> bool:
-    """Whether what is computed from this tensor is computed by the Triton kernels."""
-    return EMULATED or tensor.device.type != "cpu"

@@ -28,8 +28,8 @@ from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, PerGaussianBlocks
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import SIGMA
 from splat.model.camera import Camera
-from splat.projection.dispatch import projected
 from splat.projection.formulas import lens_of
+from splat.render.backend import backend_of
 
 RHO_OF_A_PIXEL = 1 / (4 * pi * SIGMA**2)
 CHUNK = 8192  # blocks decomposed at a time: CUDA refuses 32,768, and takes up to 1 MB of memory for each
@@ -148,7 +148,7 @@ def _kept_share(objective: SceneObjective) -> Float64[Tensor, " n"]:
 
 def _blurred_share(objective: SceneObjective, camera: Camera) -> Float64[Tensor, "2 n"]:
     """(rho, 1) of every Gaussian that a view draws; 0 for the others."""
-    splats, _, drawn = projected(objective.active, lens_of(camera, objective.settings))
+    splats, _, drawn = backend_of(objective.active.flat).project(objective.active, lens_of(camera, objective.settings))
     rho = blurred_share(splats[:, 2:5])
     return torch.where(drawn, torch.stack([rho, torch.ones_like(rho)]), 0)
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.operators.operator import require_vectors
-from splat.backend.gpu.graphs import CudaGraphCache, CudaGraphs
+from splat.backend.graphs import CudaGraphCache, CudaGraphs
 from splat.curvature.linearize import VECTORS
 from splat.curvature.null.active_spaces import Projector, projector_of
 from splat.curvature.objective import SceneObjective

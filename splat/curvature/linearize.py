@@ -23,20 +23,16 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.errors import InputError
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
-from splat.losses.cpu.loss import CpuLinearLoss
 from splat.losses.protocols import ViewLoss
 from splat.losses.reference import LossSettings
 from splat.losses.regularizers import Regularizers
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.projection.dispatch import linearize_projection
 from splat.projection.formulas import ProjectionJacobian, lens_of, row_shapes
-from splat.raster.cpu.raster import CpuRaster
-from splat.raster.dispatch import Adjoint, Raster, Tangent
-from splat.raster.formulas import BLOCK_SUMS
+from splat.render.backend import Adjoint, Raster, Tangent, backend_of
+from splat.render.formulas import BLOCK_SUMS
 from splat.render.forward import rasterize_view, touches
 
 LOSS_PLANES = 34  # a linearized loss keeps: target, its moments, gradient, blur(S_p), second derivatives, a product
@@ -66,7 +62,7 @@ class LinearizedView:
         self._loss, self._couples = loss.linearize(self._raster.planes), loss.couples_pixels
         self._adjoint = self._raster.backward(self._loss.gradient)
         self._index = self._raster.touched
-        self._projection = linearize_projection(
+        self._projection = backend_of(gaussians.flat).linearize_projection(
             gaussians, lens_of(camera, settings), self._raster.splats, self._adjoint.moments, self._index
         )
 
@@ -172,16 +168,8 @@ class LinearizedView:
         raster, index = self._raster, self._index
         if approximate or not self._couples:
             curvature, coupled = self._loss.diagonal, None
-        elif isinstance(raster, CpuRaster):
-            assert isinstance(self._loss, CpuLinearLoss)
-            coupling = self._loss.coupling()
-            curvature = torch.from_numpy(coupling.uncoupled).view_as(self._adjoint.cotangent[:3])
-            coupled = raster.coupled_blocks(coupling, index)
         else:
-            raise InputError(
-                "expected Gaussians on the CPU for exact blocks of a loss with SSIM, got them on a GPU; move them there or ask "
-                "for approximate ones"
-            )
+            curvature, coupled = raster.coupled_blocks(self._loss, index)
         found = []
         for gauss_newton in parts:
             blocks = self._raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton)

@@ -31,11 +31,11 @@ from landscape.results import Progress
 from splat.backend.memory import free_memory, give_back_freed
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import KeptViews, LinearizedView
-from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
 from splat.losses.regularizers import Regularizers
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
+from splat.render.backend import backend_of
 from splat.render.forward import background_of, rasterize_view, touches
 from splat.scenes.view import View
 
@@ -148,7 +148,9 @@ class SceneObjective:
         # products give the same bits each time, even where the training's steps do not
         self.settings = replace(settings, accumulation="deterministic")
         self.background = background_of(gaussians, background)
-        self._losses = [loss_against(view.image, loss_settings, gaussians.flat) for view in views]
+        self._losses = [
+            backend_of(gaussians.flat).view_loss(view.image, loss_settings, gaussians.flat) for view in views
+        ]
         used = gaussians.select(torch.arange(len(gaussians)), degree)
         seen, self._sizes = self._first_look(used)
         if not seen.any():

@@ -1,7 +1,4 @@
-"""The losses of `losses.py` by the kernels, as torch functions and for the second-order renderer.
-
-`loss_against` and `loss_between` alone decide which kernels these are: those where the images are.
-"""
+"""The losses of `reference.py` by the kernels, as torch functions, twice differentiable."""
 
 from dataclasses import dataclass
 
@@ -10,28 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.backend.autograd import last_derivative
-from splat.backend.device import by_triton
-from splat.losses.cpu.loss import NUMPY, CpuImageLoss, CpuViewLoss
-from splat.losses.protocols import ImageLoss, ViewLoss
-from splat.losses.reference import LossSettings
-
-
-def loss_against(target: Float[Tensor, "3 h w"], settings: LossSettings, like: Tensor) -> ViewLoss:
-    """The loss of images against a target, on the device and in the dtype of the tensor `like`."""
-    if by_triton(like):
-        from splat.losses.cuda.loss import CudaViewLoss
-
-        return CudaViewLoss(target.to(like.device), settings, like.dtype)
-    return CpuViewLoss(target, settings, like.dtype)
-
-
-def loss_between(image: Float[Tensor, "3 h w"], settings: LossSettings) -> ImageLoss:
-    """The loss of two images of the size, dtype and device of this one."""
-    if by_triton(image):
-        from splat.losses.cuda.loss import CudaImageLoss
-
-        return CudaImageLoss(image.detach(), settings)
-    return CpuImageLoss(image.shape, settings, NUMPY[image.dtype])
+from splat.losses.protocols import ViewLoss
 
 
 class _Photometric(torch.autograd.Function):
@@ -71,7 +47,7 @@ class Clamped:
 
 
 def view_loss(image: Float[Tensor, "3 h w"], loss: ViewLoss | Clamped) -> Float[Tensor, ""]:
-    """The loss of an image as a torch scalar, twice differentiable; loss: from `loss_against`, as it is or clamped."""
+    """The loss of an image as a torch scalar, twice differentiable; loss: from `Backend.view_loss`, as it is or clamped."""
     if isinstance(loss, Clamped):
         return view_loss(image.clamp(0, 1), loss.loss)
     return _Photometric.apply(image, loss)  # pyright: ignore[reportReturnType]

@@ -1,7 +1,7 @@
 """The interface of the losses where their images are.
 
-`loss_against` makes one; planes (k, H, W) are padded as the rasteriser's are (`raster/dispatch.py`), and only the first three
-are read.
+`Backend.view_loss` and `Backend.image_loss` make them.  Planes (k, H, W) are padded as the rasteriser's are
+(`render/backend.py`); only the first three are read.
 """
 
 from functools import cached_property

@@ -324,7 +324,7 @@ def chain_blocks(start, stop, jac, blocks, second_order, geometry_out, sh_out):
 
 
 class CpuProjection:
-    """The projection of one view, linearised: `projection.dispatch.Projection` by Numba kernels, on NumPy views of tensors."""
+    """The projection of one view, linearised: `projection.protocols.Projection` by Numba kernels, on NumPy views of tensors."""
 
     def __init__(
         self,

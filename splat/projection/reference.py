@@ -1,6 +1,6 @@
 """EWA projection and SH colour: stored parameters of Gaussians -> 2-D splats of one view.  The specification.
 
-Plain torch, any float type, differentiable any number of times; the kernels of `projection_cpu.py` are tested against it.
+Plain torch, any float type, differentiable any number of times; the kernels of `cpu.py` are tested against it.
 
     x      camera-space centre R (mean - centre), z its depth
     J      2 x 3 Jacobian of the pinhole projection at x (x/z and y/z clamped to fov_clamp tan(fov/2))

@@ -15,25 +15,16 @@ from splat.backend.autograd import last_derivative
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.projection.dispatch import (
-    coefficients_of,
-    linearize_projection,
-    moments_of,
-    plain_gradient,
-    plain_tangents,
-    projected,
-    projected_vjp,
-)
 from splat.projection.formulas import Lens, lens_of
 from splat.projection.reference import Splats
-from splat.raster.dispatch import Raster, rasterize
+from splat.render.backend import Raster, backend_of, coefficients_of, moments_of, plain_gradient, plain_tangents
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, flat: Tensor, sh_degree: int, widths: Tensor | None, lens: Lens):
         ctx.view = sh_degree, widths, lens
-        splats, depths, drawn = projected(Gaussians(flat.detach(), sh_degree, widths), lens)
+        splats, depths, drawn = backend_of(flat).project(Gaussians(flat.detach(), sh_degree, widths), lens)
         ctx.save_for_backward(flat, splats, drawn)
         ctx.mark_non_differentiable(depths, drawn)
         return splats, depths, drawn
@@ -52,14 +43,16 @@ class _ProjectAdjoint(torch.autograd.Function):
         ctx.view = splats, drawn, sh_degree, widths, lens
         ctx.save_for_backward(flat, bar)
         gaussians = Gaussians(flat.detach(), sh_degree, widths)
-        return projected_vjp(gaussians, lens, splats, drawn, bar.detach().contiguous())
+        return backend_of(gaussians.flat).project_vjp(gaussians, lens, splats, drawn, bar.detach().contiguous())
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
         (flat, bar), (splats, drawn, sh_degree, widths, lens) = ctx.saved_tensors, ctx.view
         gaussians, direction = Gaussians(flat.detach(), sh_degree, widths), outputs[0].detach()[:, None]
         moments = moments_of(splats, bar.detach().contiguous())
-        projection = linearize_projection(gaussians, lens, splats, moments, drawn.nonzero()[:, 0])
+        projection = backend_of(gaussians.flat).linearize_projection(
+            gaussians, lens, splats, moments, drawn.nonzero()[:, 0]
+        )
         tangents = projection.jvp(direction)
         product = projection.vjp(torch.zeros_like(tangents), direction)
         values = (product[:, 0], plain_tangents(splats, tangents[:, 0]))
@@ -111,6 +104,8 @@ def rasterize_by_kernel(
     """
     parts = (splats.means, splats.conics, splats.opacities[:, None], splats.colours)
     numbers = torch.cat([part.double() for part in parts], dim=1)
-    raster = rasterize(numbers.detach(), splats.depths.detach(), splats.drawn, background, width, height, settings)
+    raster = backend_of(numbers).rasterize(
+        numbers.detach(), splats.depths.detach(), splats.drawn, background, width, height, settings
+    )
     planes: Tensor = _Rasterize.apply(numbers, raster)  # pyright: ignore
     return planes[:3], planes[3]

@@ -8,9 +8,8 @@ from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.projection.dispatch import projected
 from splat.projection.formulas import lens_of
-from splat.raster.dispatch import Raster, rasterize
+from splat.render.backend import Raster, backend_of
 
 
 def rasterize_view(
@@ -24,9 +23,10 @@ def rasterize_view(
     """Project and composite a view by the kernels where the Gaussians are; finite: they are known to be, and not checked."""
     if not finite:
         gaussians.require_finite()
-    splats = projected(gaussians, lens_of(camera, settings))
+    backend = backend_of(gaussians.flat)
+    splats = backend.project(gaussians, lens_of(camera, settings))
     background = background.to(gaussians.flat, non_blocking=True)
-    return rasterize(*splats, background, camera.width, camera.height, settings)
+    return backend.rasterize(*splats, background, camera.width, camera.height, settings)
 
 
 def background_of(gaussians: Gaussians, colour: Float[Tensor, "3"] | None) -> Float[Tensor, "3"]:

@@ -13,10 +13,9 @@ from splat.losses.protocols import ViewLoss
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.projection.dispatch import plain_gradient, projected, projected_vjp
 from splat.projection.formulas import lens_of
 from splat.projection.reference import Splats
-from splat.raster.dispatch import rasterize
+from splat.render.backend import backend_of, plain_gradient
 from splat.render.forward import background_of
 
 OPACITY = 5  # column of the opacities in splats (n, 9)
@@ -48,10 +47,12 @@ class ViewPass:
     ):
         gaussians.require_finite()
         self._gaussians, self._lens = gaussians.with_flat(gaussians.flat.detach()), lens_of(camera, settings)
-        self._splats, self._depths, self._drawn = projected(self._gaussians, self._lens)
+        self._backend = backend_of(gaussians.flat)
+        self._splats, self._depths, self._drawn = self._backend.project(self._gaussians, self._lens)
         self._opacity_scale = opacity_scale
         shown, size = self._scaled(self._splats), (camera.width, camera.height)
-        self.raster = rasterize(shown, self._depths, self._drawn, background_of(gaussians, background), *size, settings)
+        behind = background_of(gaussians, background)
+        self.raster = self._backend.rasterize(shown, self._depths, self._drawn, behind, *size, settings)
 
     def _scaled(self, numbers: Float[Tensor, "n 9"]) -> Float[Tensor, "n 9"]:
         """Splats, or their plain adjoints, with the opacities' column multiplied by opacity_scale."""
@@ -69,7 +70,7 @@ class ViewPass:
     def pull_back(self, cotangent: Float[Tensor, "4 H W"]) -> tuple[Float[Tensor, " p"], Float[Tensor, "n 2"]]:
         """The gradients in the stored parameters and in the splats' means, given that in the planes."""
         bar = plain_gradient(self.raster.splats, self.raster.backward(cotangent).moments)
-        gradient = projected_vjp(self._gaussians, self._lens, self._splats, self._drawn, self._scaled(bar))
+        gradient = self._backend.project_vjp(self._gaussians, self._lens, self._splats, self._drawn, self._scaled(bar))
         return gradient, bar[:, :2]
 
 

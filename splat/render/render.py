@@ -11,9 +11,9 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.reference import Splats, project
-from splat.raster.reference import rasterize_reference
 from splat.render.autograd import project_by_kernel, rasterize_by_kernel
 from splat.render.forward import background_of
+from splat.render.reference import rasterize_reference
 
 Backend = Literal["kernels", "reference"]
 

@@ -11,10 +11,10 @@ from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.projection.dispatch import projected
 from splat.projection.formulas import lens_of
 from splat.projection.reference import condition
-from splat.raster.cpu.raster import CpuRaster
+from splat.render.backend import backend_of
+from splat.render.cpu.raster import CpuRaster
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ def sight(gaussians: Gaussians, camera: Camera, settings: RenderSettings = Rende
     """
     if gaussians.flat.device.type != "cpu":
         raise InputError("expected Gaussians on the CPU, got them on a GPU; move them there")
-    splats, depths, drawn = projected(gaussians, lens_of(camera, settings))
+    splats, depths, drawn = backend_of(gaussians.flat).project(gaussians, lens_of(camera, settings))
     raster = CpuRaster(splats, depths, drawn, gaussians.flat.new_zeros(3), camera.width, camera.height, settings)
     red = torch.zeros_like(raster.crop(raster.planes))
     red[0] = 1

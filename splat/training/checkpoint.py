@@ -27,9 +27,9 @@ from splat.model.typed import MOST, Count, leaves, typed
 from splat.model.untrusted import replacing, require_whole
 from splat.scenes.scene import Scene
 from splat.scenes.splits import spread_views
+from splat.training.adam import Adam
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
-from splat.training.optim.adam import Adam
 from splat.training.origin.foreign import Foreign, foreign_training
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import Method, ThreeDGS, TrainConfig, Training

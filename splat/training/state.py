@@ -23,7 +23,7 @@ from landscape.operators.distributed import ALONE, Ranks
 from landscape.results import Brief
 from splat.backend.memory import free_memory
 from splat.curvature.objective import SceneObjective
-from splat.losses.autograd import Clamped, loss_against
+from splat.losses.autograd import Clamped
 from splat.losses.protocols import ViewLoss
 from splat.losses.reference import LossSettings
 from splat.losses.regularizers import Regularizers
@@ -32,10 +32,11 @@ from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.model.typed import MOST, Count, Length, NonNegative, Positive, Settings, Share, typed
 from splat.projection.antialias import sampling_widths
+from splat.render.backend import backend_of
 from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
 from splat.scenes.view import View
+from splat.training.adam import Adam
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
-from splat.training.optim.adam import Adam
 
 FILTER_EVERY = 100  # steps
 LOSS_PLANES = 9  # planes that a loss keeps: of a target and its moments
@@ -231,7 +232,7 @@ class TrainConfig(Settings):
 
     def loss_against(self, image: Float[Tensor, "3 h w"], like: Tensor) -> ViewLoss | Clamped:
         """The loss of a step against a view's image; like: see `splat.losses.autograd.loss_against`."""
-        loss = loss_against(image, self.loss, like)
+        loss = backend_of(like).view_loss(image, self.loss, like)
         return Clamped(loss) if self.clamp_image else loss
 
     def losses_against(self, views: Sequence[View], like: Tensor) -> Callable[[int], ViewLoss | Clamped]:

@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import splat.raster.cpu.raster  # noqa: F401
+import splat.render.cpu.raster  # noqa: F401
 from analysis.commands import cli
 from analysis.console import drawing
 from analysis.console.failures import program as run_program

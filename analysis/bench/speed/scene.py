@@ -32,7 +32,7 @@ Wholes:
 
 One code for the CPU and for GPUs: where the workload's Gaussians are decides which kernels run, and a `Meter` measures them.
 
-Arithmetic is counted from `raster/formulas.py`: additions, multiplications, fused multiply-adds, divisions and
+Arithmetic is counted from `render/formulas.py`: additions, multiplications, fused multiply-adds, divisions and
 minima of one pixel and Gaussian, comparisons and integer operations left out, each worth one fused multiply-add.  Bytes are
 those that a pass reads and writes for each entry (its splat's 64, its index and slot, 48 a tangent, 36 of sums, written and
 added up) and for each pixel of the image, in single precision; they come from memory or a cache.  A pair is a (pixel, Gaussian)
@@ -52,15 +52,12 @@ from analysis.bench.speed.peer import MissingPeer, gsplat_gradient
 from analysis.bench.speed.timing import Timing, interleaved
 from analysis.bench.workloads import Workload
 from landscape.probes import draw_probes
-from splat.backend.device import by_triton
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import LinearizedView
-from splat.losses.autograd import loss_against, view_loss
+from splat.losses.autograd import view_loss
 from splat.model.settings import Accumulation
-from splat.projection.dispatch import plain_gradient, projected, projected_vjp
 from splat.projection.formulas import lens_of
-from splat.raster.cpu.raster import CpuRaster
-from splat.raster.dispatch import rasterize
+from splat.render.backend import CPU, backend_of, plain_gradient
 from splat.render.render import render
 
 VECTORS = (1, 4, 8)
@@ -86,8 +83,9 @@ class ViewBench:
         self.like, camera = workload.gaussians.flat.detach(), self.view.camera
         self.lens = lens_of(camera, workload.settings)
         self.background = workload.background.to(self.like)
-        self.loss = loss_against(self.view.image, workload.loss, self.like)
-        self.projected = projected(workload.gaussians, self.lens)
+        self.backend = backend_of(self.like)
+        self.loss = self.backend.view_loss(self.view.image, workload.loss, self.like)
+        self.projected = self.backend.project(workload.gaussians, self.lens)
         self.raster = self._rasterize(self.projected)
         self.cotangent = self.loss.linearize(self.raster.planes).gradient
         self.adjoint = self.raster.backward(self.cotangent)
@@ -98,7 +96,7 @@ class ViewBench:
 
     def _rasterize(self, found: tuple[torch.Tensor, torch.Tensor, torch.Tensor]) -> Any:
         camera, settings = self.view.camera, self.workload.settings
-        return rasterize(*found, self.background, camera.width, camera.height, settings)
+        return self.backend.rasterize(*found, self.background, camera.width, camera.height, settings)
 
     def _linearize(self) -> Any:
         w = self.workload
@@ -106,14 +104,14 @@ class ViewBench:
 
     def gradient(self) -> torch.Tensor:
         """Gradient of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
-        splats, depths, drawn = projected(self.workload.gaussians, self.lens)
+        splats, depths, drawn = self.backend.project(self.workload.gaussians, self.lens)
         raster = self._rasterize((splats, depths, drawn))
         adjoint = raster.backward(self.loss.linearize(raster.planes, second_order=False).gradient)
         return self._to_parameters(splats, drawn, adjoint)
 
     def _to_parameters(self, splats: torch.Tensor, drawn: torch.Tensor, adjoint: Any) -> torch.Tensor:
         bar = plain_gradient(splats, adjoint.moments)
-        return projected_vjp(self.workload.gaussians, self.lens, splats, drawn, bar)
+        return self.backend.project_vjp(self.workload.gaussians, self.lens, splats, drawn, bar)
 
     def gradient_by_autograd(self, accumulation: Accumulation = "deterministic") -> torch.Tensor:
         """The gradient through the graph of torch."""
@@ -126,7 +124,7 @@ class ViewBench:
         """The parts of a gradient and of a product with one vector, and compositing alone."""
         passes, (splats, _, drawn) = self.compositing(), self.projected
         return {
-            "project": lambda: projected(self.workload.gaussians, self.lens),
+            "project": lambda: self.backend.project(self.workload.gaussians, self.lens),
             **passes,
             "loss": lambda: self.loss.linearize(self.raster.planes),
             "project adjoint": lambda: self._to_parameters(splats, drawn, self.adjoint),
@@ -166,12 +164,12 @@ class ViewBench:
             "linearize": self._linearize,
             **products,
             "block diagonal": self._block_diagonal,
-            **({} if by_triton(self.like) else {"exact blocks": self.linearized.block_diagonal}),
+            **({"exact blocks": self.linearized.block_diagonal} if self.backend.exact_blocks else {}),
         }
 
     def peers(self) -> Calls:
         """Gradients to compare with on a GPU: by the faster sums, and by gsplat where it is installed."""
-        if not by_triton(self.like):
+        if self.backend is CPU:
             return {}
         calls: Calls = {"gradient, atomic": lambda: self.gradient_by_autograd("atomic")}
         try:
@@ -183,18 +181,6 @@ class ViewBench:
     def _block_diagonal(self) -> PerGaussianBlocks:
         vars(self.linearized._loss).pop("diagonal", None)  # it keeps the loss's share, which is part of the cost
         return self.linearized.block_diagonal(approximate=True)
-
-    @property
-    def pairs(self) -> int:
-        """(pixel, Gaussian) pairs that a pass evaluates."""
-        raster = self.raster
-        if not isinstance(raster, CpuRaster):
-            from splat.raster.cuda.binning import HEIGHT, WIDTH
-
-            return raster.intersections_reached * WIDTH * HEIGHT
-        packed = raster.reached[0].rows
-        rows = ((packed >> 8) & 255) - (packed & 255) + 1
-        return int(rows.sum()) * raster.plane[1] // raster.frame.columns
 
     def bytes_of(self, name: str) -> int:
         """Bytes that a pass reads and writes."""
@@ -250,7 +236,7 @@ def scaling(workload: Workload, repetitions: int, meter: Meter) -> Iterator[tupl
         yield "pixels", part.pixels, scaled_times(part, repetitions, meter)
     for views in powers_of_two(len(workload.views)):
         yield "views", views, scaled_times(workload, repetitions, meter, views)
-    if by_triton(workload.gaussians.flat):
+    if backend_of(workload.gaussians.flat) is not CPU:
         return
     before = torch.get_num_threads()
     try:

@@ -18,7 +18,7 @@ from splat.model.camera import Camera
 from splat.model.gaussians import ATTRIBUTES, Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.reference import project
-from splat.raster.reference import rasterize_reference
+from splat.render.reference import rasterize_reference
 from splat.render.render import render
 
 WIDTH, HEIGHT = 24, 16

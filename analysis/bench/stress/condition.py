@@ -22,7 +22,7 @@ from analysis.bench.stress.cases import BACKGROUND, Case
 from splat.losses.reference import C1, C2, LossSettings, blur, pixel_loss
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import Splats, project
-from splat.raster.reference import rasterize_reference
+from splat.render.reference import rasterize_reference
 
 STEP, DRAWS = 1e-9, 6
 SAMPLING = sqrt(DRAWS / chi2.ppf(0.01, DRAWS))

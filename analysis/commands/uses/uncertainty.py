@@ -32,8 +32,8 @@ from landscape.errors import InputError
 from splat.curvature.linearize import LinearizedView
 from splat.curvature.scores.information import Information, prior_of
 from splat.curvature.scores.uncertainty import pixel_variance
-from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
+from splat.render.backend import CPU
 from splat.scenes.view import View
 
 RECORD = "uncertainty.json"  # the file by which a folder of results is known
@@ -66,7 +66,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         with stages.stage("views") as report:
             for place, view in enumerate(held_out):
                 linearized = LinearizedView(
-                    gaussians, view.camera, loss_against(view.image, L2, gaussians.flat), background, config.render
+                    gaussians, view.camera, CPU.view_loss(view.image, L2, gaussians.flat), background, config.render
                 )
                 found, maps = _compared(linearized, view, total, generator, options.samples)
                 rows += found

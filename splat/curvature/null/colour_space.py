@@ -13,7 +13,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splat.backend.cpu.threads import over_range
-from splat.backend.device import by_triton
 from splat.curvature.null.colour_space_cpu import project_colours
 from splat.curvature.null.row_space import (
     CHUNK,
@@ -28,6 +27,7 @@ from splat.curvature.null.row_space import (
 )
 from splat.model.gaussians import Gaussians
 from splat.projection.formulas import ProjectionJacobian
+from splat.render.backend import CPU, backend_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class ColourSpace:
 
     def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         """Orthogonal projection of x onto the space."""
-        return self._by_products(x) if by_triton(x) else self._by_kernel(x)
+        return self._by_kernel(x) if backend_of(x) is CPU else self._by_products(x)
 
     def _by_kernel(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         (n, d, k), bands = x.shape, self.harmonics.basis.shape[2]

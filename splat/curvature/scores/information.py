@@ -26,12 +26,12 @@ from torch import Tensor
 from splat.curvature.fields import eigenvalues, on_complement
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import LinearizedView
-from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.model.settings import RenderSettings
+from splat.render.backend import backend_of
 
 GAINS = ("d", "t", "e", "d_diagonal", "published")
 PRIOR = 1e-3
@@ -116,7 +116,7 @@ def _squares(
 ) -> PerGaussianBlocks:
     """The blocks of J^T J: the mean of squared errors has l'' = 2 / (3 h w)."""
     nothing = torch.zeros(3, camera.height, camera.width)
-    loss = loss_against(nothing, LossSettings("l2", ssim_weight=0), gaussians.flat)
+    loss = backend_of(gaussians.flat).view_loss(nothing, LossSettings("l2", ssim_weight=0), gaussians.flat)
     view = LinearizedView(gaussians, camera, loss, background.to(gaussians.flat), settings)
     blocks, pixels = view.block_diagonal(gauss_newton=True), 1.5 * camera.height * camera.width
     return PerGaussianBlocks(pixels * blocks.geometry, pixels * blocks.sh)

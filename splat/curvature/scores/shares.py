@@ -24,11 +24,11 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.probes import draw_probes
 from landscape.results import Progress
-from splat.backend.device import by_triton
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, PerGaussianBlocks
 from splat.curvature.hessian import ViewSum
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
+from splat.render.backend import backend_of
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def block_shares(
         raise InputError(f"expected at least 2 samples of the blocks' share, got {samples}")
     active = objective.active
     Z = draw_probes(active.flat.numel(), samples, generator, active.flat.dtype, "rademacher").to(active.flat.device)
-    couplings = [True, False] if coupled and not by_triton(active.flat) else [False]
+    couplings = [True, False] if coupled and backend_of(active.flat).exact_blocks else [False]
     if not objective.couples_pixels:
         couplings = [True]  # l'' is its diagonal
     found: list[BlockShare] = []

@@ -1,7 +1,7 @@
 """The losses of `splat/losses/reference.py` on the CPU: value, gradient and Hessian-vector products of an image's loss against
 its target, and value and gradients of the consistency of two images.
 
-Planes are padded as in `raster/cpu/raster.py`; only the first three are read, and the padding of an output is 0.
+Planes are padded as in `render/cpu/raster.py`; only the first three are read, and the padding of an output is 0.
 """
 
 from collections.abc import Callable, Sequence

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.losses.autograd import loss_between
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import on_screen
+from splat.render.backend import backend_of
 from splat.render.loss_and_gradient import ViewPass
 from splat.training.state import Step
 
@@ -35,7 +35,8 @@ def agreement_gradients(
     if not any(on_screen(each.splats, camera).any() for each in passes):
         return None
     first, second = (each.raster for each in passes)
-    loss = loss_between(first.crop(first.planes)[:3], settings or step.config.loss)
+    image = first.crop(first.planes)[:3]
+    loss = backend_of(image).image_loss(image, settings or step.config.loss)
     _, cotangents = loss.consistency(first.planes[:3], second.planes[:3])
     of_alpha = torch.zeros_like(first.planes[3:])
     in_first, in_second = (

@@ -22,7 +22,7 @@ from analysis.commands.cli import main
 from figures import bench as figure
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import SceneObjective
-from splat.raster.formulas import SPLAT
+from splat.render.formulas import SPLAT
 
 ROOT = Path(__file__).parents[3]
 TINY = Size(60, 40, 24)
@@ -86,7 +86,7 @@ def test_pairs_are_the_pixels_of_the_rows_that_are_passed(bench):
     lists, _ = bench.raster.reached
     count = sum((int(r) >> 8 & 255) - (int(r) & 255) + 1 for r in lists.rows)
     assert bench.linearized.intersections == lists.rows.size > 0
-    assert bench.pairs == count * lanes_of(np.float32)
+    assert bench.raster.pairs == count * lanes_of(np.float32)
 
 
 def test_memory_is_that_of_the_arrays(bench):

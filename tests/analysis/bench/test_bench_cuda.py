@@ -19,8 +19,9 @@ from analysis.bench.speed.peer import MissingPeer, gsplat_gradient
 from analysis.bench.speed.scene import BYTES, ViewBench
 from analysis.bench.speed.timing import Timing
 from analysis.bench.workloads import Workload
-from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
+from splat.render.backend import backend_of
+from tests.splat.gpu.emulated import emulate
 from tests.splat.held_scenes import two_views
 from tests.splat.random_scenes import random_gaussians, relative_error
 
@@ -47,7 +48,7 @@ class StillClock(HostMeter):
 @pytest.fixture
 def gpu(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     """The device, with its kernels for all tensors on it."""
-    monkeypatch.setattr("splat.backend.device.EMULATED", device.type == "cpu")
+    emulate(monkeypatch, device.type == "cpu")
     return device
 
 
@@ -75,12 +76,12 @@ def test_a_bench_on_a_gpu_measures_every_stage_and_names_a_missing_peer(gpu, mon
     )
 
     found = [own.gradient(), own.gradient_by_autograd(), own.gradient_by_autograd("atomic"), own.linearized.gradient]
-    monkeypatch.setattr("splat.backend.device.EMULATED", False)
+    emulate(monkeypatch, False)
     expected = ViewBench(toy())
     for gradient in found:
         assert relative_error(gradient.cpu(), expected.gradient()) < 1e-5
     entries = own.raster.intersections_reached
-    assert own.pairs == 256 * entries > 0 and own.bytes_of("forward") == 68 * entries + 24 * 16 * 12
+    assert own.raster.pairs == 256 * entries > 0 and own.bytes_of("forward") == 68 * entries + 24 * 16 * 12
     assert BYTES.keys() == bench.OPERATIONS.keys()
 
 
@@ -95,7 +96,7 @@ def test_gsplat_is_given_the_same_view_and_the_same_loss(monkeypatch):
     monkeypatch.setattr(module, "rasterization", rasterization, raising=False)
     monkeypatch.setitem(sys.modules, "gsplat", module)
     view = workload.views[0]
-    loss = loss_against(view.image, workload.loss, workload.gaussians.flat)
+    loss = backend_of(workload.gaussians.flat).view_loss(view.image, workload.loss, workload.gaussians.flat)
     gsplat_gradient(workload, view, loss)()
     homogeneous = torch.cat([workload.gaussians.means, torch.ones(4, 1)], dim=1) @ seen["poses"][0].T
     camera = view.camera

@@ -30,9 +30,9 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from splat.training.adam import Adam
 from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from splat.training.densify import ScreenGradients
-from splat.training.optim.adam import Adam
 from tests.recorded import soft
 
 SCENE = SyntheticSettings(gaussians=50, views=4, width=16, height=12)

@@ -14,9 +14,9 @@ from splat.losses.reference import photometric_loss
 from splat.render.render import render
 from splat.scenes.synthetic import synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from splat.training.adam import Adam
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import ScreenGradients
-from splat.training.optim.adam import Adam
 from tests.analysis.probe.probed import SCENE, unlimited
 
 

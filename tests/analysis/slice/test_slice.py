@@ -27,9 +27,9 @@ from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from splat.training.adam import Adam
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import ScreenGradients
-from splat.training.optim.adam import Adam
 from tests.recorded import soft, synthetic, synthetic_line, written
 
 ROOT = Path(__file__).parents[3]

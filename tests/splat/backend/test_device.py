@@ -3,11 +3,18 @@
 import pytest
 import torch
 
-from splat.backend.device import by_triton, device_named
+from landscape.errors import InputError
+from splat.backend.device import device_named
+from splat.render.backend import CPU, backend_of
 
 
-def test_the_cpu_is_the_cpu_and_no_work_for_triton():
-    assert device_named("cpu") == torch.device("cpu") and not by_triton(torch.zeros(1))
+def test_the_cpu_is_the_cpu_and_has_kernels_of_its_own():
+    assert device_named("cpu") == torch.device("cpu") and backend_of(torch.zeros(1)) is CPU
+
+
+def test_a_device_without_kernels_is_refused_in_a_sentence():
+    with pytest.raises(InputError, match=r"whose kernels are loaded \(cpu.*\), got one on meta; take the device from"):
+        backend_of(torch.zeros(1, device="meta"))
 
 
 @pytest.mark.parametrize(
@@ -36,11 +43,15 @@ def test_a_gpu_that_can_be_used_is_used(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr("splat.backend.device.find_spec", lambda name: object())
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    loaded: list[str] = []
+    monkeypatch.setattr("splat.backend.device.import_module", loaded.append)
     assert device_named("auto") == device_named("cuda") == torch.device("cuda", 0)
+    assert loaded == ["splat.gpu"] * 2
 
 
 def test_each_of_a_machines_processes_takes_a_gpu_of_its_own_and_too_few_are_one_clear_sentence(monkeypatch):
     monkeypatch.setattr("splat.backend.device._lack", lambda: None)
+    monkeypatch.setattr("splat.backend.device.import_module", lambda _name: None)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     for processes, taken in ((1, [0]), (2, [0, 1])):
         monkeypatch.setenv("LOCAL_WORLD_SIZE", str(processes))

@@ -119,7 +119,7 @@ def test_own_blocks_with_ssim_are_differences_of_gradients() -> None:
 def test_splats_that_are_looked_at_together_change_no_bit(monkeypatch) -> None:
     objective = objective_of(awkward_gaussians(), WITH_SSIM[0], noise=0.3)
     whole = objective.block_diagonal().geometry
-    monkeypatch.setattr("splat.raster.cpu.raster.FOOTPRINT_BYTES", 1)
+    monkeypatch.setattr("splat.render.cpu.raster.FOOTPRINT_BYTES", 1)
     assert torch.equal(objective.block_diagonal().geometry, whole)
 
 

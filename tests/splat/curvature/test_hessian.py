@@ -18,7 +18,7 @@ from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import project
-from splat.raster.reference import rasterize_reference
+from splat.render.reference import rasterize_reference
 from splat.render.render import render
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, mean_loss, two_views
 from tests.splat.random_scenes import errors_by_block, random_gaussians, random_like, relative_error

@@ -11,9 +11,10 @@ from scipy.ndimage import correlate1d
 from torch import Tensor
 
 from landscape.errors import InputError
-from splat.losses.autograd import loss_between, view_loss
+from splat.losses.autograd import view_loss
 from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import WINDOW, LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map, window
+from splat.render.backend import backend_of
 from tests.oracles import similarity_by_windows
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, random_like, relative_error
 
@@ -280,7 +281,7 @@ def test_a_third_derivative_by_the_kernels_is_refused():
 
 def consistency(x: Tensor, y: Tensor, settings: LossSettings) -> tuple[Tensor, Tensor, Tensor]:
     """The loss of two images by the kernels, and its gradients in both."""
-    loss = loss_between(x, settings)
+    loss = backend_of(x).image_loss(x, settings)
     value, (in_x, in_y) = loss.consistency(loss.padded(x), loss.padded(y))
     return value, loss.cropped(in_x), loss.cropped(in_y)
 
@@ -316,7 +317,7 @@ def test_consistency_is_symmetric_to_the_bit(settings, dtype):
 @each_loss
 def test_consistency_reads_no_padding_and_leaves_0_in_its_own(settings):
     x, y = image_and_target((37, 53))
-    loss = loss_between(x, settings)
+    loss = backend_of(x).image_loss(x, settings)
     planes = [loss.padded(x), loss.padded(y)]
     expected = loss.consistency(*planes)
     for plane in planes:

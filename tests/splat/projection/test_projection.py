@@ -15,10 +15,10 @@ from splat.model.gaussians import Gaussians
 from splat.model.harmonics import harmonics
 from splat.model.settings import Antialias, RenderSettings
 from splat.projection.cpu import attribute_arrays, project_adjoint, project_arrays, width_array
-from splat.projection.dispatch import moments_of, plain_tangents
 from splat.projection.formulas import GEOMETRY, lens_of
 from splat.projection.linear_cpu import CpuProjection
 from splat.projection.reference import Splats, project, rotation_matrices
+from splat.render.backend import moments_of, plain_tangents
 from tests.oracles import (
     central_difference,
     hessian_in_many_digits,

@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from splat.losses.autograd import Clamped, loss_against, view_loss
+from splat.losses.autograd import Clamped, view_loss
 from splat.losses.reference import LossSettings
 from splat.model.settings import RenderSettings
+from splat.render.backend import backend_of
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from tests.splat.held_scenes import BACKGROUND, two_views
@@ -22,7 +23,7 @@ def test_loss_and_gradients_are_those_of_torch_through_the_render(antialias, cla
     gaussians.means[0, 2] = -1.0  # behind the camera
     scale = torch.linspace(0, 1.5, 60) if scaled else None
     settings, background = RenderSettings(antialias=antialias), BACKGROUND.to(dtype)
-    loss = loss_against(view.image, LossSettings("charbonnier"), gaussians.flat)
+    loss = backend_of(gaussians.flat).view_loss(view.image, LossSettings("charbonnier"), gaussians.flat)
     loss = Clamped(loss) if clamped else loss
     flat = gaussians.flat.clone().requires_grad_()
     drawn = render(gaussians.with_flat(flat), view.camera, background, settings, opacity_scale=scale)

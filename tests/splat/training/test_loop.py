@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from splat.backend.cpu.adam import EPS
 from splat.losses.reference import LossSettings, photometric_loss
 from splat.model.settings import RenderSettings
 from splat.projection.antialias import sampling_widths
-from splat.raster.dispatch import rasterize
+from splat.render.backend import backend_of
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.scenes.scene import load_scene
@@ -23,7 +24,6 @@ from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings, densify
 from splat.training.loop import prepare, train, with_background
-from splat.training.optim.adam import EPS
 from splat.training.score.evaluate import evaluate
 from splat.training.state import LearningRates, TrainConfig, Training, learning_rates, position_rate
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
@@ -306,7 +306,7 @@ def test_a_random_background_is_drawn_anew_at_each_step(monkeypatch):
 
     def recorded(splats, depths, drawn, background, *others):
         colours.append(tuple(background.tolist()))
-        return rasterize(splats, depths, drawn, background, *others)
+        return backend_of(splats).rasterize(splats, depths, drawn, background, *others)
 
     monkeypatch.setattr("splat.render.loss_and_gradient.rasterize", recorded)
     run(TrainConfig(4, random_background=True))

@@ -27,6 +27,7 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
 from splat.model.typed import NonNegative, Positive, typed
+from splat.render.backend import backend_of
 from splat.scenes.view import View
 from splat.training.densify import DensifySettings
 from splat.training.loop import with_background
@@ -124,7 +125,8 @@ class SecondOrderMethod(Method[S], Generic[S]):
             raise InputError(
                 f"expected clamp_image=false for {name}, whose Hessian is that of the image before it is clamped"
             )
-        if training.gaussians.flat.is_cuda and self.settings.coupling and config.loss.ssim_weight:
+        exact = backend_of(training.gaussians.flat).exact_blocks
+        if not exact and self.settings.coupling and config.loss.ssim_weight:
             raise InputError(
                 f"expected --device cpu for {name}: the exact blocks of a loss with SSIM are made there alone; give it, or "
                 "--set coupling=false, or --ssim-weight 0"

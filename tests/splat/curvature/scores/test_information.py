@@ -8,9 +8,9 @@ from scipy.linalg import null_space
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS
 from splat.curvature.linearize import LinearizedView
 from splat.curvature.scores.information import COLUMNS, FISHERRF_LAMBDA, GAINS, PRIOR, gains, information, prior_of
-from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
+from splat.render.backend import backend_of
 from tests.splat.held_scenes import BACKGROUND
 from tests.splat.random_scenes import random_camera, random_gaussians
 
@@ -26,7 +26,9 @@ def toy() -> Gaussians:
 
 def jacobian(gaussians: Gaussians, camera) -> np.ndarray:
     """(p, 3, pixels)"""
-    loss = loss_against(torch.zeros(3, 22, 30), LossSettings("l2", ssim_weight=0), gaussians.flat)
+    loss = backend_of(gaussians.flat).view_loss(
+        torch.zeros(3, 22, 30), LossSettings("l2", ssim_weight=0), gaussians.flat
+    )
     view = LinearizedView(gaussians, camera, loss, BACKGROUND)
     return view.jvp(torch.eye(gaussians.flat.numel(), dtype=torch.float64))[:, :3].flatten(2).numpy()
 

@@ -7,8 +7,8 @@ from splat.curvature.fields import complement
 from splat.curvature.linearize import LinearizedView
 from splat.curvature.scores.information import information, prior_of
 from splat.curvature.scores.uncertainty import pixel_variance, pushed
-from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
+from splat.render.backend import backend_of
 from tests.splat.held_scenes import BACKGROUND
 from tests.splat.random_scenes import random_camera, random_gaussians
 
@@ -20,7 +20,9 @@ def test_variances_are_those_of_the_dense_covariance(diagonal):
     gaussians.quats.div_(gaussians.quats.norm(dim=1, keepdim=True))
     seen = information(gaussians, cameras[0], BACKGROUND)
     total = seen + prior_of(seen)
-    loss = loss_against(torch.zeros(3, 22, 30), LossSettings("l2", ssim_weight=0), gaussians.flat)
+    loss = backend_of(gaussians.flat).view_loss(
+        torch.zeros(3, 22, 30), LossSettings("l2", ssim_weight=0), gaussians.flat
+    )
     view = LinearizedView(gaussians, cameras[1], loss, BACKGROUND)
     J = view.jvp(torch.eye(gaussians.flat.numel(), dtype=torch.float64))[:, :3]
     exact, rows = torch.zeros(22, 30, dtype=torch.float64), gaussians.blocks

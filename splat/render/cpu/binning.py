@@ -1,0 +1,163 @@
+"""Tile lists: which splats touch which tiles of an image, in order of depth, and in which rows.
+
+A splat is drawn where its alpha is at least alpha_min, inside the ellipse a dx^2 + 2 b dx dy + c dy^2 <= 2 ln(o / alpha_min)
+(or contour_sigma^2, where that is less).  Its rows in a tile are those of the ellipse within the tile's columns, found in
+double precision and rounded outwards.  Splats: (n, 9), as in `projection/whitening.py`.
+"""
+
+import numpy as np
+
+from splat.backend.cpu.jit import kernel
+from splat.backend.cpu.planes import TILE_ROWS
+from splat.backend.cpu.simd import lanes_of
+from splat.backend.cpu.threads import over_range
+from splat.render.cpu.tile import Lists
+from splat.render.formulas import Thresholds, box_of, ellipse_of, rows_of_strip
+
+RADIX_BITS = 11
+
+
+def depth_order(depths: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """Indices of the drawn splats, nearest first, equal depths in the order of their index."""
+    index = np.flatnonzero(drawn).astype(np.int32)
+    if depths.dtype == np.float32:  # positive floats sort as the integers of their bits
+        return radix_argsort(depths[index].view(np.uint32), index)
+    return index[np.argsort(depths[index], kind="stable")]
+
+
+@kernel
+def radix_argsort(keys, index):
+    """index, reordered so that the 32-bit keys ascend; stable. Overwrites both."""
+    n = keys.size
+    buckets = 1 << RADIX_BITS
+    other_keys, other_index = np.empty_like(keys), np.empty_like(index)
+    for digit in range(3):
+        shift = np.uint32(digit * RADIX_BITS)
+        place = np.zeros(buckets + 1, np.int64)
+        for i in range(n):
+            place[((keys[i] >> shift) & np.uint32(buckets - 1)) + 1] += 1
+        for d in range(buckets):
+            place[d + 1] += place[d]
+        for i in range(n):
+            d = (keys[i] >> shift) & np.uint32(buckets - 1)
+            other_keys[place[d]], other_index[place[d]] = keys[i], index[i]
+            place[d] += 1
+        keys, other_keys = other_keys, keys
+        index, other_index = other_index, index
+    return index
+
+
+@kernel
+def count_tiles(start, stop, splats, order, tile, width, height, alpha_min, contour, bound):
+    """An upper bound of the number of tiles each splat touches: those of its ellipse's box."""
+    for i in range(start, stop):
+        splat = splats[order[i]]
+        x0, x1, y0, y1 = box_of(splat, ellipse_of(splat, alpha_min, contour), width, height)
+        bound[i] = 0
+        if x0 <= x1 and y0 <= y1:
+            bound[i] = (x1 // tile - x0 // tile + 1) * (y1 // TILE_ROWS - y0 // TILE_ROWS + 1)
+
+
+@kernel
+def list_tiles(start, stop, splats, order, tile, columns, width, height, alpha_min, contour, place, count, tiles, rows):
+    """The tiles that each splat touches and its rows in them, at place[i], place[i] + 1, ...; count[i] of them."""
+    for i in range(start, stop):
+        count[i] = 0
+        if place[i + 1] > place[i]:
+            own_tiles, own_rows = tiles[place[i] :], rows[place[i] :]
+            splat = splats[order[i]]
+            count[i] = list_splat(splat, tile, columns, width, height, alpha_min, contour, own_tiles, own_rows)
+
+
+@kernel
+def list_splat(splat, tile, columns, width, height, alpha_min, contour, tiles, rows):
+    ellipse = ellipse_of(splat, alpha_min, contour)
+    x0, x1, _y0, _y1 = box_of(splat, ellipse, width, height)
+    k = 0
+    for column in range(x0 // tile, x1 // tile + 1):
+        y0, y1 = rows_of_strip(splat, ellipse, column, tile, width, height)
+        if y0 <= y1:
+            for row in range(y0 // TILE_ROWS, y1 // TILE_ROWS + 1):
+                top, bottom = max(y0 - row * TILE_ROWS, 0), min(y1 - row * TILE_ROWS, TILE_ROWS - 1)
+                tiles[k] = row * columns + column
+                rows[k] = top | bottom << 8
+                k += 1
+    return k
+
+
+@kernel
+def fill_lists(order, place, count, tiles, rows, start, splat_of, rows_of):
+    """Sort the intersections by tile, in order of depth within each; start: (tiles + 1,) becomes where each tile's begin."""
+    start[:] = 0
+    for i in range(order.size):
+        for k in range(place[i], place[i] + count[i]):
+            start[tiles[k] + 1] += 1
+    for t in range(start.size - 1):
+        start[t + 1] += start[t]
+    following = start[:-1].copy()
+    for i in range(order.size):
+        for k in range(place[i], place[i] + count[i]):
+            e = following[tiles[k]]
+            following[tiles[k]] = e + 1
+            splat_of[e] = order[i]
+            rows_of[e] = rows[k]
+
+
+def bin_splats(
+    splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, thresholds: Thresholds
+) -> Lists:
+    """The tile lists of a view; the tiles are ordered heaviest first.  Accumulators come with `reached_lists`."""
+    tile = lanes_of(depths.dtype)
+    columns = -(-width // tile)
+    tile_count = columns * -(-height // TILE_ROWS)
+    order = depth_order(depths, drawn)
+    where = (tile, width, height, thresholds.alpha_min, thresholds.contour)
+    bound = np.empty(order.size, np.int64)
+    over_range(order.size, count_tiles, splats, order, *where, bound)
+    place = np.zeros(order.size + 1, np.int64)
+    np.cumsum(bound, out=place[1:])
+    count = np.empty(order.size, np.int32)
+    tiles, rows = np.empty(place[-1], np.int32), np.empty(place[-1], np.int32)
+    over_range(order.size, list_tiles, splats, order, tile, columns, *where[1:], place, count, tiles, rows)
+    intersections, start = int(count.sum()), np.empty(tile_count + 1, np.int64)
+    splat_of, rows_of = np.empty(intersections, np.int32), np.empty(intersections, np.int32)
+    fill_lists(order, place, count, tiles, rows, start, splat_of, rows_of)
+    return Lists(start, splat_of, rows_of, np.empty(0, np.int32), heaviest_first(np.diff(start)))
+
+
+@kernel
+def keep_reached(lists, kept_start, splat_of, rows, accumulator, splat_start):
+    """Copy the intersections that some pixel reaches, and number them splat by splat.
+
+    kept_start: (tiles + 1,) where each tile's begin; splat i's are numbers splat_start[i] .. splat_start[i + 1] - 1.
+    """
+    splat_start[:] = 0
+    for t in range(kept_start.size - 1):
+        first = lists.start[t]
+        for e in range(kept_start[t], kept_start[t + 1]):
+            splat_of[e], rows[e] = lists.splat[first + e - kept_start[t]], lists.rows[first + e - kept_start[t]]
+            splat_start[splat_of[e] + 1] += 1
+    for i in range(splat_start.size - 1):
+        splat_start[i + 1] += splat_start[i]
+    following = splat_start[:-1].copy()
+    for e in range(splat_of.size):
+        accumulator[e] = following[splat_of[e]]
+        following[splat_of[e]] += 1
+
+
+def reached_lists(lists: Lists, reached: np.ndarray, n: int) -> tuple[Lists, np.ndarray]:
+    """The lists without the intersections behind each tile's last stop, with accumulators; and splat_start (n + 1,).
+
+    reached: (tiles,) how many intersections of each tile some pixel reaches.
+    """
+    start = np.zeros(reached.size + 1, np.int64)
+    np.cumsum(reached, out=start[1:])
+    splat_of, rows, accumulator = (np.empty(start[-1], np.int32) for _ in range(3))
+    splat_start = np.empty(n + 1, np.int64)
+    keep_reached(lists, start, splat_of, rows, accumulator, splat_start)
+    return Lists(start, splat_of, rows, accumulator, heaviest_first(reached)), splat_start
+
+
+def heaviest_first(work: np.ndarray) -> np.ndarray:
+    """Tiles with the most work first, so that threads finish together."""
+    return np.argsort(-work, kind="stable")

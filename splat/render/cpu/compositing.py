@@ -1,0 +1,158 @@
+"""The compositing kernels of first order: `forward` front to back, `backward` back to front (`render/formulas.py`)."""
+
+import numpy as np
+
+from splat.backend.cpu.jit import formula, kernel
+from splat.backend.cpu.planes import TILE_ROWS, scratch
+from splat.backend.cpu.simd import any_lane, fma, lanes, load, maximum, prefetch, select, store
+from splat.render.cpu.tile import (
+    AHEAD,
+    BACKWARD,
+    FORWARD,
+    GRAD,
+    IMAGE,
+    NEVER,
+    PARAMS,
+    REST,
+    STOP,
+    T,
+    add_row,
+    clear_sums,
+    corner_of,
+    dark,
+    intersection,
+    load3,
+    load_cotangent,
+    next_tile,
+    no_moments,
+    reached,
+    row_v,
+    store3,
+    store_moments,
+)
+from splat.render.formulas import SPLAT, alpha_row, behind_all, plus, step_back
+
+# --- forward ----------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def forward(counter, params, lists, frame, pixels):
+    """Render: fill `pixels`.  A row's T is negative once a pixel has stopped."""
+    L = lanes(params)
+    state = scratch(params, FORWARD * L * TILE_ROWS)
+    tile = next_tile(counter, lists)
+    while tile >= 0:
+        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        for y in range(TILE_ROWS):
+            b = FORWARD * L * y
+            store(state, b + T * L, 1.0)
+            store(state, b + STOP * L, NEVER)
+            store3(state, b + IMAGE * L, L, (0.0, 0.0, 0.0))
+        first = np.int64(lists.start[tile])
+        count = lists.start[tile + 1] - first
+        some_stopped = False
+        for k in range(count):
+            prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
+            some_stopped |= composite(params, lists, first + k, k, x0, y0, frame, state)
+            if some_stopped and (k & 15) == 15:
+                some_stopped = False
+                if all_stopped(state, L):
+                    break
+        for y in range(TILE_ROWS):
+            end_row(state, FORWARD * L * y, L, frame, pixels, corner + y * frame.stride)
+        tile = next_tile(counter, lists)
+
+
+@formula
+def composite(params, lists, e, k, x0, y0, frame, state):
+    """Composite intersection e; True if it stopped a pixel."""
+    L = lanes(params)
+    _splat, _u, terms, colour, _index, top, bottom = intersection(params, lists, e, k, x0, y0)
+    stopped = False
+    for y in range(top, bottom):
+        b = FORWARD * L * y
+        before = load(state, b + T * L)
+        alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, before > 0.0, frame.cap)
+        w = alpha * before
+        after = fma(-alpha, before, before)  # T - w, to the last bit even where alpha is near 1
+        ends = (after < frame.floor) & (before > 0.0)
+        if any_lane(ends):  # these pixels stop in front of the splat
+            w = select(ends, 0.0, w)
+            after = select(ends, -before, after)
+            store(state, b + STOP * L, select(ends, k, load(state, b + STOP * L)))
+            stopped = True
+        store(state, b + T * L, after)
+        store3(state, b + IMAGE * L, L, plus(load3(state, b + IMAGE * L, L), w, colour))
+    return stopped
+
+
+@formula
+def end_row(state, b, L, frame, pixels, p):
+    """Add the background to a row, and write it."""
+    last = maximum(load(state, b + T * L), -load(state, b + T * L))
+    store(pixels.transmittance, p, last)
+    store(pixels.stop, p, load(state, b + STOP * L))
+    image = plus(load3(state, b + IMAGE * L, L), last, frame.background)
+    store3(pixels.planes, p, frame.size, image)
+    store(pixels.planes, 3 * frame.size + p, 1.0 - last)
+
+
+@formula
+def all_stopped(state, L):
+    for y in range(TILE_ROWS):
+        if any_lane(load(state, (FORWARD * y + T) * L) > 0.0):
+            return False
+    return True
+
+
+# --- backward ---------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def backward(counter, params, lists, frame, pixels, v_planes, sums):
+    """The nine sums of every intersection from the cotangent of the planes."""
+    L = lanes(params)
+    state = scratch(params, BACKWARD * L * TILE_ROWS)
+    tile = next_tile(counter, lists)
+    while tile >= 0:
+        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        for y in range(TILE_ROWS):
+            begin_backward_row(state, BACKWARD * L * y, L, frame, pixels, v_planes, corner + y * frame.stride)
+        first, count = reached(lists, tile, pixels, corner, frame.stride)
+        if dark(v_planes, 0, 4, corner, frame.size, frame.stride):
+            clear_sums(lists, first, count, SPLAT, sums)
+            count = 0
+        for k in range(count - 1, -1, -1):
+            later = first + max(k - AHEAD, 0)
+            prefetch(params, np.int64(lists.splat[later]) * PARAMS)
+            prefetch(sums, np.int64(lists.accumulator[later]) * SPLAT)
+            differentiate(params, lists, first + k, k, x0, y0, frame, state, sums)
+        tile = next_tile(counter, lists)
+
+
+@formula
+def begin_backward_row(state, b, L, frame, pixels, v_planes, p):
+    last, v_pixel = load(pixels.transmittance, p), load_cotangent(v_planes, p, frame.size)
+    store(state, b + T * L, last)
+    store(state, b + STOP * L, load(pixels.stop, p))
+    store(state, b + REST * L, last * behind_all(v_pixel, frame.background))
+    store3(state, b + GRAD * L, L, v_pixel)
+
+
+@formula
+def differentiate(params, lists, e, k, x0, y0, frame, state, sums):
+    """Undo intersection e, and write its sums."""
+    L = lanes(params)
+    _splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
+    moments = no_moments(params)
+    for y in range(top, bottom):
+        b = BACKWARD * L * y
+        v = row_v(frame, L, y, terms)
+        alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
+        R, v_image = load(state, b + REST * L), load3(state, b + GRAD * L, L)
+        before, rest, w, beta, _r, we = step_back(alpha, load(state, b + T * L), R, v_image, colour)
+        s = select(uncapped <= frame.free, we - beta * R, 0.0)
+        store(state, b + T * L, before)
+        store(state, b + REST * L, rest)
+        moments = add_row(moments, v, s, w, v_image)
+    store_moments(sums, np.int64(lists.accumulator[e]), moments, u)

@@ -1,0 +1,240 @@
+"""The arrays of the compositing kernels on the CPU, and how a tile of them is read and written.
+
+A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  An intersection is a splat in a tile.  Each writes
+its nine sums to an accumulator of its own, and those of a splat lie side by side, so that no sum depends on the order in which
+threads finish.  Every kernel (`compositing.py`, `tangents.py`, `blocks.py`) takes tiles from a counter until none is left
+(`threads.over_tiles`).  Arrays are flat: `params` holds PARAMS floats a splat, `tangents` K x SPLAT floats a splat, a plane
+stride x height floats.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from splat.backend.cpu.jit import formula
+from splat.backend.cpu.planes import TILE_ROWS
+from splat.backend.cpu.simd import (
+    any_lane,
+    broadcast,
+    fetch_and_increment,
+    fma,
+    iota,
+    lanes,
+    load,
+    maximum,
+    select,
+    store,
+    store_sums,
+)
+from splat.render.formulas import SPLAT, along_row, alpha_row, column_terms, reciprocal, row_terms
+
+NEVER = 1e30  # the stop index of a pixel that does not stop
+AHEAD = 6  # intersections between a prefetch and its use
+
+PARAMS = 16  # one cache line in float32: mean x, y (pixel index units), the whitening, LO = log2 o; _REST: of a rounded number
+MX, MX_REST, MY, MY_REST, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT = range(13)
+
+# The vectors that a kernel keeps of a row of pixels, in this order; a number is the first of its channels.
+T, STOP = 0, 1  # transmittance, and the index of the intersection at which a pixel stops
+IMAGE, FORWARD = 2, 5
+REST, GRAD, BACKWARD = 2, 3, 6  # R and v_image
+BEHIND, UNDO = 2, 5  # the colour behind, of the passes in `blocks.py` and `footprints.py`
+DT, DIMAGE, TANGENT = 0, 1, 4  # after T and STOP, for each of K tangents
+TAU, DREST, DGRAD, BACKWARD_TANGENT = 0, 1, 2, 5  # after those of `backward`, for each of K tangents
+
+
+class Lists(NamedTuple):
+    """Splats that touch each tile, in order of depth.
+
+    start: (tiles + 1,) first intersection of each tile; splat: (intersections,); rows: (intersections,) first row |
+    last row << 8 within the tile; accumulator: (intersections,) where their sums go, splat by splat;
+    order: the tiles as they are handed out.
+    """
+
+    start: np.ndarray
+    splat: np.ndarray
+    rows: np.ndarray
+    accumulator: np.ndarray
+    order: np.ndarray
+
+
+class Frame(NamedTuple):
+    """Constants of all pixels: tiles in a row, floats in a row of a plane, floats in a plane, cap, background (3,).
+
+    free, floor: as in `formulas.Thresholds`.  row_offsets: 0, ..., TILE_ROWS - 1, each `lanes` times: as vectors, they cost
+    the kernels less than a conversion.
+    """
+
+    columns: int
+    stride: int
+    size: int
+    cap: float
+    free: float
+    floor: float
+    background: np.ndarray
+    row_offsets: np.ndarray
+
+
+class Pixels(NamedTuple):
+    """Results of `forward` in each pixel: planes (red, green, blue, alpha), the final T, and where it stopped."""
+
+    planes: np.ndarray
+    transmittance: np.ndarray
+    stop: np.ndarray
+
+
+@formula
+def next_tile(counter, lists):
+    """The next tile that no thread has taken, or -1."""
+    turn = fetch_and_increment(counter)
+    return lists.order[turn] if turn < lists.order.size else np.int64(-1)
+
+
+@formula
+def corner_of(tile, lanes, columns, stride):
+    """Column and row of a tile's first pixel, and its index in a plane."""
+    x0, y0 = (tile % columns) * lanes, (tile // columns) * TILE_ROWS
+    return x0, y0, y0 * stride + x0
+
+
+@formula
+def row_range(packed):
+    """First row and one past the last row of an intersection."""
+    return packed & 255, ((packed >> 8) & 255) + 1
+
+
+@formula
+def alpha_terms(params, o, x0, y0):
+    """u of a tile's columns, and what gives v and log2 alpha of its rows: v of row 0, its step, log2 o - u^2, cut.
+
+    The offset of the tile's corner is in double precision: far from the mean, v of a needle is a small difference.
+    """
+    along, across = params[o + ALONG], params[o + ACROSS]
+    shear = np.float64(params[o + SHEAR]) + params[o + SHEAR_REST]
+    dx = x0 - np.float64(params[o + MX]) - params[o + MX_REST]
+    dy = y0 - np.float64(params[o + MY]) - params[o + MY_REST]
+    u = fma(iota(params), along, along * dx)
+    v = fma(iota(params), across * shear, across * (shear * dx + dy))
+    terms = (v, broadcast(params, across), fma(-u, u, params[o + LO]), broadcast(params, params[o + CUT]))
+    return u, terms
+
+
+@formula
+def intersection(params, lists, e, k, x0, y0):
+    """Intersection e, which is number k of its tile, as all kernels read it.
+
+    Its splat, u of the columns, `alpha_terms`, colour, k, its first row and one past the last.
+    """
+    splat = np.int64(lists.splat[e])
+    u, terms = alpha_terms(params, splat * PARAMS, x0, y0)
+    top, bottom = row_range(lists.rows[e])
+    colour = broadcast3(params, splat * PARAMS + RED)
+    return splat, u, terms, colour, broadcast(params, k), top, bottom
+
+
+@formula
+def row_v(frame, L, y, terms):
+    """v of a tile's row y."""
+    return fma(load(frame.row_offsets, L * y), terms[1], terms[0])
+
+
+@formula
+def begin_undo_row(state, b, L, frame, pixels, p):
+    """Start a row behind all splats: T, STOP, and the background's colour times T."""
+    last = load(pixels.transmittance, p)
+    store(state, b + T * L, last)
+    store(state, b + STOP * L, load(pixels.stop, p))
+    for c in range(3):
+        store(state, b + (BEHIND + c) * L, last * frame.background[c])
+
+
+@formula
+def undo_row(state, b, L, frame, v, terms, index):
+    """Undo a splat in T of a row; w, and w and beta where the cap does not hold."""
+    alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
+    r = reciprocal(1.0 - alpha)
+    before = load(state, b + T * L) * r
+    store(state, b + T * L, before)
+    w, free = alpha * before, uncapped <= frame.free
+    return w, select(free, w, 0.0), select(free, alpha * r, 0.0)
+
+
+@formula
+def tangent_terms(tangents, j, u):
+    """q' of a row as a quadratic in v, and the colour's tangent."""
+    q = (tangents[j], tangents[j + 1], tangents[j + 2], tangents[j + 3], tangents[j + 4], tangents[j + 5])
+    A, B, C = along_row(q, u)
+    return (A, B, broadcast(tangents, C)), broadcast3(tangents, j + 6)
+
+
+@formula
+def broadcast3(array, i):
+    return broadcast(array, array[i]), broadcast(array, array[i + 1]), broadcast(array, array[i + 2])
+
+
+@formula
+def load3(array, i, step):
+    return load(array, i), load(array, i + step), load(array, i + 2 * step)
+
+
+@formula
+def store3(array, i, step, values):
+    store(array, i, values[0])
+    store(array, i + step, values[1])
+    store(array, i + 2 * step, values[2])
+
+
+@formula
+def load_cotangent(planes, p, size):
+    """v_image and v_alpha of a row."""
+    return load(planes, p), load(planes, p + size), load(planes, p + 2 * size), load(planes, p + 3 * size)
+
+
+@formula
+def reached(lists, tile, pixels, corner, stride):
+    """The first intersection of a tile, and how many of its intersections some pixel reaches before it stops."""
+    furthest = load(pixels.stop, corner)
+    for y in range(1, TILE_ROWS):
+        furthest = maximum(furthest, load(pixels.stop, corner + y * stride))
+    row = np.empty(lanes(pixels.stop), pixels.stop.dtype)
+    store(row, 0, furthest)
+    first = np.int64(lists.start[tile])
+    return first, np.int64(min(lists.start[tile + 1] - first, row.max()))
+
+
+@formula
+def dark(planes, first_plane, count, corner, size, stride):
+    """Whether `count` planes are exactly 0 all over a tile: a cotangent that leaves nothing to do."""
+    lit, one = broadcast(planes, 0.0), broadcast(planes, 1.0)
+    for plane in range(first_plane, first_plane + count):
+        for y in range(TILE_ROWS):
+            value = load(planes, plane * size + corner + y * stride)
+            lit = select((value >= 0.0) & (value <= 0.0), lit, one)  # NaN is neither
+    return not any_lane(lit > 0.0)
+
+
+@formula
+def clear_sums(lists, first, count, width, sums):
+    """Zeros for the sums, `width` an intersection, of a tile's intersections."""
+    for e in range(first, first + count):
+        at = np.int64(lists.accumulator[e]) * width
+        for j in range(width):
+            sums[at + j] = 0
+
+
+@formula
+def no_moments(params):
+    zero = broadcast(params, 0.0)
+    return zero, zero, zero, zero, zero, zero
+
+
+@formula
+def add_row(m, v, s, w, h):
+    """The sums over rows, with a row more."""
+    t = row_terms(v, s, w, h)
+    return m[0] + t[0], m[1] + t[1], m[2] + t[2], m[3] + t[3], m[4] + t[4], m[5] + t[5]
+
+
+@formula
+def store_moments(sums, accumulator, moments, u):
+    store_sums(sums, accumulator * SPLAT, column_terms(moments, u))
