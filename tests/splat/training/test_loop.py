@@ -14,7 +14,7 @@ from splat.backend.cpu.adam import EPS
 from splat.losses.reference import LossSettings, photometric_loss
 from splat.model.settings import RenderSettings
 from splat.projection.antialias import sampling_widths
-from splat.render.backend import backend_of
+from splat.render.cpu.raster import CpuRaster
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.scenes.scene import load_scene
@@ -306,9 +306,9 @@ def test_a_random_background_is_drawn_anew_at_each_step(monkeypatch):
 
     def recorded(splats, depths, drawn, background, *others):
         colours.append(tuple(background.tolist()))
-        return backend_of(splats).rasterize(splats, depths, drawn, background, *others)
+        return CpuRaster(splats, depths, drawn, background, *others)
 
-    monkeypatch.setattr("splat.render.loss_and_gradient.rasterize", recorded)
+    monkeypatch.setattr("splat.render.backend.CpuRaster", recorded)
     run(TrainConfig(4, random_background=True))
     assert len(set(colours)) == 4
     colours.clear()
