@@ -32,8 +32,8 @@ from landscape.probes import draw_probes
 from landscape.results import Brief, Progress
 from landscape.traces.choice import WORSE, outside_sketch
 from landscape.traces.hutchinson import joined
-from landscape.traces.sketched import added_directions
-from landscape.traces.sketched_diagonal import sketched_samples
+from landscape.traces.sketches.sketched import added_directions
+from landscape.traces.sketches.sketched_diagonal import sketched_samples
 
 Method = Literal["auto", "signs"]
 FEWEST = 4  # test vectors of a sketch
@@ -56,7 +56,7 @@ class GroupSums(Brief):
 class DiagonalEstimate(Brief):
     """diag H.  samples: one column for each test vector, with the mean `values`.
 
-    matvecs: products used.  method: "signs" or "sketch".
+    matvecs: products used.  method: "signs", "sketch" or "pixels" (`pixels`, where products are samples).
     """
 
     values: Float64[Tensor, " n"]

@@ -167,7 +167,7 @@ class RendererHessian:
         return views * (1 + 2 * vectors) + TRIALS * vectors, views * (once if self.curved else vectors)
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         return self.products(V)[0]
 
     def error(self, V: Float[Tensor, "n k"]) -> ProductErrors:

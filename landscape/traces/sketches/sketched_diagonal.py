@@ -23,7 +23,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.linalg import gram
-from landscape.traces.sketched import left_out_directions
+from landscape.traces.sketches.sketched import left_out_directions
 
 ROWS = 16_384  # rows at a time
 

@@ -7,7 +7,7 @@ import torch
 from landscape.linalg import gram
 from landscape.operators.operator import CountingOperator, DenseOperator
 from landscape.traces.diagonal import estimate_diagonal
-from landscape.traces.sketched_diagonal import _Small, sketched_samples
+from landscape.traces.sketches.sketched_diagonal import _Small, sketched_samples
 from tests.landscape.spectra import generator
 from tests.oracles import symmetric_matrix
 

@@ -10,7 +10,7 @@ import torch
 from landscape.operators.operator import CountingOperator, DenseOperator
 from landscape.traces.choice import chosen
 from landscape.traces.hutchinson import TraceSettings
-from landscape.traces.sketched import _leave_out, hutch_plus_plus, xtrace
+from landscape.traces.sketches.sketched import _leave_out, hutch_plus_plus, xtrace
 from landscape.traces.trace import estimate_traces
 from tests.landscape.spectra import generator
 from tests.oracles import symmetric_matrix
