@@ -43,7 +43,7 @@ VECTORS = 8  # most vectors in a product at a time: more would not fit into the 
 class LinearizedView:
     """A view's loss, linearised at its Gaussians: `.value`, `.image`, `.gradient`, `.jvp(U)`, `.vjp(G)`, `.hvp(U)`, `.ggn(U)`.
 
-    loss: compares images with the view's, from `losses.autograd.loss_against`.  regularizers: added to the loss; by default
+    loss: compares images with the view's, from `Backend.view_loss`.  regularizers: added to the loss; by default
     none.
     """
 

@@ -24,7 +24,8 @@ from splat import (
     synthetic_scene,
     train,
 )
-from splat.losses.autograd import loss_against, view_loss
+from splat.losses.autograd import view_loss
+from splat.render.backend import backend_of
 from splat.render.render import render
 
 PIXELS = torch.linspace(-1, 1, 40, dtype=torch.float64)
@@ -93,7 +94,9 @@ class SplatScene:
         named = {name: value.clone().requires_grad_() for name, value in active.attributes.items()}
         # SSIM in float32 would be wrong by 0.1% in all products
         like = self.objective.active.flat
-        losses = [loss_against(view.image, self.objective.loss_settings, like) for view in self.objective.views]
+        losses = [
+            backend_of(like).view_loss(view.image, self.objective.loss_settings, like) for view in self.objective.views
+        ]
         cameras = [view.camera for view in self.objective.views]
         return RendererHessian(
             lambda view: render(Gaussians.pack(named), cameras[view]).image,

@@ -31,7 +31,7 @@ from analysis.train.options import TrainOptions
 from analysis.train.scores import render_name
 from splat.losses.reference import psnr
 from splat.model.gaussians import ATTRIBUTES
-from splat.render.cpu.raster import CpuRaster
+from splat.render.forward import background_of
 from splat.render.render import render
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -171,11 +171,11 @@ def test_a_signal_saves_a_checkpoint_and_says_how_to_continue(finished, original
         presses.append(1)
         if len(presses) == 4:
             os.kill(os.getpid(), kind)
-        return CpuRaster(*given)
+        return background_of(*given)
 
     before = [signal.getsignal(each) or signal.SIG_DFL for each in (signal.SIGINT, signal.SIGTERM)]
     with monkeypatch.context() as patch:
-        patch.setattr("splat.render.backend.CpuRaster", press)
+        patch.setattr("splat.render.loss_and_gradient.background_of", press)
         assert main(command) == 128 + kind
     assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
     said = " ".join(capsys.readouterr().err.split())

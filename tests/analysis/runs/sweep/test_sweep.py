@@ -29,7 +29,7 @@ from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from splat.losses.reference import LossSettings
 from splat.model.untrusted import locked
-from splat.render.cpu.raster import CpuRaster
+from splat.render.forward import background_of
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
@@ -99,10 +99,10 @@ def finished(folder) -> Sweep:
         steps.append(1)
         if len(steps) == 3:
             os.kill(os.getpid(), signal.SIGINT)
-        return CpuRaster(*given)
+        return background_of(*given)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("splat.render.backend.CpuRaster", press)
+        patch.setattr("splat.render.loss_and_gradient.background_of", press)
         assert main(arguments("train", sweep.cells[0].training)) == 130
     assert load_checkpoint(sweep.cells[0].out / "checkpoint.pt").training.step == 3
     assert main(["sweep", str(sweep.file), "--jobs", "2"]) == 0

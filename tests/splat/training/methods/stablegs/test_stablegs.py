@@ -125,7 +125,7 @@ def test_a_viewpoint_that_sees_nothing_adds_nothing(monkeypatch):
     step = first_step(StableGS(warm_up=0, asp_weight=0.0, probe=PROBE))
     away = replace(step.camera, centre=torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64))
     monkeypatch.setattr(stablegs, "composite_pose", lambda *_, **__: away)
-    monkeypatch.setattr(agreement, "loss_between", None)
+    monkeypatch.setattr(agreement, "backend_of", None)
     base = base_of(step)
     assert torch.equal(step.training.method.gradient(step, base).gradient, base.gradient)
 
