@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
+from msgspec import UNSET
 
 from analysis.console.failures import program
 from analysis.records.findings import attribute_name
@@ -227,7 +228,11 @@ def draw_comparison(folder: Path, suffix: str = "png") -> list[Path]:
     """Draw what the records of the comparison in the folder have the numbers for; returns the files."""
     if not (folder / COMPARISON).is_file():
         raise FileNotFoundError(f"expected a folder written by `landscape compare` (with {COMPARISON}), got {folder}")
-    records = {label: read_record(path, ProbeRecord) for label, path in read_comparison(folder).runs.items()}
+    compared = read_comparison(folder)
+    records = {label: read_record(path, ProbeRecord) for label, path in compared.runs.items()}
+    for label, record in records.items():
+        if record.data.provenance.fingerprint != compared.fingerprints.get(label, UNSET):
+            raise InputError(f"expected the record that was compared in {record.folder}, got another; compare again")
     arrays = [record.arrays for record in records.values()]
     known = {"compare_densities": any("nodes" in each.get("spectrum", {}) for each in arrays)}
     known |= {"compare_slices": any(map(_has_surface, records.values()))}

@@ -37,6 +37,16 @@ def written(folder: Path, data: dict[str, Any], arrays: dict[str, dict[str, np.n
     return read_record(folder)
 
 
+def own(run: Path, **options: Any) -> dict[str, Any]:
+    """The fingerprint of a probe with these options of the checkpoint in a run, for a record's provenance."""
+    from analysis.probe.command import asked  # slow
+    from analysis.probe.options import ProbeOptions
+    from splat.training.checkpoint import load_checkpoint
+
+    path = run / "checkpoint.pt"
+    return {"fingerprint": plain(asked(ProbeOptions(path, **options), load_checkpoint(path)))}
+
+
 def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:
     """(data, arrays) of a probe, for `written`; every curvature is multiplied by `scale`."""
     random = np.random.default_rng(seed)

@@ -1,10 +1,12 @@
 """`landscape convert`: Gaussians from one tool's file to another's, or depth maps of their scene's views."""
 
 import os
+import shlex
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from io import BytesIO
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -13,6 +15,8 @@ from rich.console import Console
 from analysis.commands.options import ConvertOptions
 from analysis.console.plain import say
 from analysis.probe.command import opened
+from analysis.runs.sweep.sweep_file import arguments
+from analysis.train.options import TrainOptions
 from landscape.errors import InputError
 from splat.model.files.read import is_foreign, read_splats
 from splat.model.files.splat_file import SplatFile
@@ -21,8 +25,11 @@ from splat.model.files.tensor_files import gsplat_bytes
 from splat.model.settings import RenderSettings
 from splat.projection.antialias import baked
 from splat.render.render import render_depth
+from splat.scenes.scene import Scene
+from splat.scenes.splits import split_scene
 from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
 from splat.training.origin.presets import PRESETS, render_of
+from splat.training.origin.scene_reference import SceneReference
 
 OURS = ("splat-landscape", "splat-landscape-mip")
 FAINT = 0.01  # of alpha: what is less covered is as far as the farthest that is not
@@ -118,9 +125,21 @@ def _to_depths(options: ConvertOptions) -> list[str]:
             path = options.out / PurePosixPath(view.name).with_suffix(".npy")
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, content.getvalue())
-    return [
-        f"depth of {len(views)} views: landscape train {scene.root} --method fsgs --depths {options.out} --set depths=depth"
-    ]
+    again = arguments("train", _with_depths(checkpoint.scene, scene, options.out))
+    return [f"depth of {len(views)} views: {shlex.join(['landscape', *again])}"]
+
+
+def _with_depths(reference: SceneReference, scene: Scene, depths: Path) -> TrainOptions:
+    """Options of a training on the same views, with these depth maps beside which their list is written where it has to be."""
+    options = TrainOptions(scene.root, images=reference.images, downscale=reference.downscale, method="fsgs")
+    options = replace(options, depths=depths, set=("depths=depth",))
+    for views in (len(reference.train), "all"):
+        with suppress(InputError):  # there may be more of them than a protocol has
+            if [*split_scene(scene, None if views == "all" else views).train] == reference.train:
+                return replace(options, views=views)
+    listed = depths / "train.txt"
+    write_atomically(listed, "".join(f"{name}\n" for name in reference.train).encode())
+    return replace(options, train_list=listed)
 
 
 def _foreign(options: ConvertOptions) -> tuple[SplatFile, Seen | None]:

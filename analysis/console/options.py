@@ -56,7 +56,7 @@ class TrainerOptions:
 
 @dataclass(frozen=True)
 class ForeignOptions(TrainerOptions):
-    """What a file that another tool trained does not say; a checkpoint of landscape train holds all but max_views."""
+    """What a file that another tool trained does not say; a checkpoint of landscape train holds all but the last two."""
 
     views: Unset[int | Literal["all"]] = None
     """Of another tool's file: number of its training views, by the scene's protocol.
@@ -69,6 +69,8 @@ class ForeignOptions(TrainerOptions):
     """Of another tool's file: factor by which its images were reduced.  Default: what its tool does."""
     max_views: Unset[int] = None
     """Measure on at most so many training views, spread evenly over the cameras.  Default: all."""
+    accept_changed: FlagCreatePairsOff[bool] = False
+    """Go on where cameras, photographs or masks are not as they were in the training, which is said and refused else."""
 
 
 CheckpointPath = Annotated[

@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
-from hashlib import file_digest
 from math import inf, isfinite
 from pathlib import Path
 from time import monotonic, perf_counter
@@ -34,7 +33,7 @@ from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import remarks, summary
 from analysis.probe.views import write_views
-from analysis.records.provenance import require_seed, versions
+from analysis.records.provenance import require_seed
 from analysis.records.records import Arrays, ProbeRecord, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
 from analysis.train.source import of_trainer
@@ -48,8 +47,8 @@ from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
 from splat.scenes.splits import read_names
-from splat.scenes.view import digests
 from splat.training.checkpoint import Checkpoint, open_checkpoint
+from splat.training.origin.fingerprint import Fingerprint
 
 if TYPE_CHECKING:
     from analysis.measures.families import FamilyOptions
@@ -90,7 +89,8 @@ def _run(
     after = {} if families is None else families.expected
     say(_introduction(scene, checkpoint, objective), console=console)
     say(_expected(objective, settings, after), console=console)
-    identity = _identity(options, settings, scene, checkpoint, device)
+    made = asked(options, checkpoint)
+    identity = f"{made.but('settings.families').digest} {device}"  # families are measured after what is kept
     # the folder is opened first, so that one that cannot be written is refused before anything is measured
     with (
         record_folder(out) if writes else nullcontext() as folder,
@@ -103,8 +103,8 @@ def _run(
             objective, settings, generator, stages, None if ranks else unfinished, identity,
             deadline=begun + limit - DRAWING, population=checkpoint.all_views, after=after,
         )  # fmt: skip
-        made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
-        data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
+        origin = provenance_of(made, options.checkpoint, command, checkpoint, scene)
+        data, arrays = probe_record(found, objective, origin, stages.timing), probe_arrays(found)
         data.steps = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
         if families is not None:
             data = _with_families(data, arrays, families, objective, checkpoint, generator, stages, found.ends)
@@ -140,17 +140,11 @@ def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[No
         raise
 
 
-def _identity(
-    options: ProbeOptions, settings: ProbeSettings, scene: Scene, checkpoint: Checkpoint, device: torch.device
-) -> str:
-    """All that the results of stages depend on, as text: kept ones of another identity are not read."""
-    pictures = digests(scene.select(checkpoint.scene.train))
-    with options.checkpoint.open("rb") as stream:
-        content = file_digest(stream, "sha256").hexdigest()
-    return (
-        f"{content} {options.foreign} {options.loss} {scene.root} {pictures} {settings} {options.seed} {device} "
-        f"{versions()}"
-    )
+def asked(options: ProbeOptions, checkpoint: Checkpoint) -> Fingerprint:
+    """What the numbers of a probe with these options are about.  checkpoint: thinned as they say."""
+    families = _family_options(options)
+    settings = asdict(_settings(options)) | ({} if families is None else {"families": asdict(families)})
+    return checkpoint.fingerprint(settings, options.seed, LossSettings() if options.loss == "3dgs" else None)
 
 
 def _with_families(
@@ -169,9 +163,7 @@ def _with_families(
     training, stream = checkpoint.training, spawn(generator)
     families = measure_families(objective, training, options, stream, stages.stage, ends)
     arrays["families"] = families.arrays()
-    data = families.added_to(data)
-    data.provenance.families = asdict(options)
-    return data
+    return families.added_to(data)
 
 
 def _write(
@@ -198,7 +190,7 @@ def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> t
     files = replace(of_trainer(ask), scene=folder, images=ask.images, downscale=ask.downscale)
     foreign = replace(files, views=ask.views, train_list=listed)
     checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
-    scene = checkpoint.load_scene(path, folder)
+    checkpoint, scene = checkpoint.with_scene(path, folder, accept=ask.accept_changed)
     return checkpoint.thinned(scene, ask.max_views), scene
 
 

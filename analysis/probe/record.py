@@ -2,10 +2,9 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from math import isfinite, nan
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,8 +29,8 @@ from splat.curvature.scores.shares import BlockShare
 from splat.curvature.traces import curvature_scale
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
-from splat.scenes.view import digests
 from splat.training.checkpoint import Checkpoint
+from splat.training.origin.fingerprint import Fingerprint
 
 NAMES = ("e₁", "e₂")  # of the slice's directions
 QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
@@ -94,23 +93,22 @@ def grid_arrays(grid: Grid) -> dict[str, np.ndarray]:
 
 
 def provenance_of(
-    seed: int, path: Path, command: Sequence[str], settings: Any, checkpoint: Checkpoint, scene: Scene
+    made: Fingerprint, path: Path, command: Sequence[str], checkpoint: Checkpoint, scene: Scene
 ) -> Provenance:
-    """Provenance of a record.  path: of the checkpoint; settings: a dataclass; command: as typed."""
+    """Provenance of a record of these numbers.  path: of the checkpoint; command: as typed."""
     return provenance(
-        seed,
+        made.question["seed"],
         lanes=lanes_of(np.float32),
         checkpoint=str(path),
         origin=UNSET if checkpoint.origin is None else checkpoint.origin,
         scene=scene.name,
         scene_folder=str(scene.root),
         views=list(checkpoint.scene.train),
-        photographs=digests(scene.select(checkpoint.scene.train)),
         iteration=checkpoint.training.step,
         dtype=str(checkpoint.training.gaussians.flat.dtype).removeprefix("torch."),
         threads=torch.get_num_threads(),
         command=shlex.join(command),
-        settings=asdict(settings),
+        fingerprint=made,
     )
 
 

@@ -12,6 +12,7 @@ from msgspec import UNSET, Struct
 
 from analysis.records.schema import Maybe
 from landscape.errors import InputError
+from splat.training.origin.fingerprint import Fingerprint
 
 PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib", "pyvista", "plotly")
 
@@ -29,8 +30,8 @@ class Provenance(Struct, kw_only=True):
     """Origin of numbers.  versions: of Python and packages, None for what is not installed.
 
     commit: of the checkout that the code lies in, ending in + where files differ from it; None without git or outside of one.
-    origin: of another tool's file, what was assumed.  photographs: what tells the file of each view from any other.
-    other: the checkpoint at the other end of a line.  settings: of the command; families: those of the families.
+    origin: of another tool's file, what was assumed.  other: the checkpoint at the other end of a line.  fingerprint: what the
+    numbers are about.
     """
 
     created: str
@@ -44,19 +45,23 @@ class Provenance(Struct, kw_only=True):
     scene: Maybe[str] = UNSET
     scene_folder: Maybe[str] = UNSET
     views: Maybe[list[str] | None] = UNSET
-    photographs: Maybe[list[str] | None] = UNSET
     iteration: Maybe[int] = UNSET
     dtype: Maybe[str] = UNSET
     threads: Maybe[int] = UNSET
     command: Maybe[str] = UNSET
-    settings: Maybe[dict[str, Any]] = UNSET
-    families: Maybe[dict[str, Any]] = UNSET
+    fingerprint: Maybe[Fingerprint] = UNSET
 
 
 def require_seed(seed: int) -> None:
     """InputError where it is out of range."""
     if not 0 <= seed < 2**63:
         raise InputError(f"expected a seed in [0, 2^63), got {seed}")
+
+
+def require_own(found: Maybe[Fingerprint | None], state: str, path: Path, remedy: str) -> None:
+    """InputError unless the numbers of a record are of the checkpoint in this state."""
+    if not found or found.state != state:
+        raise InputError(f"expected in {path} a record of the checkpoint beside it, got one of another; {remedy}")
 
 
 def provenance(seed: int, *, lanes: int | None = None, **more: Any) -> Provenance:

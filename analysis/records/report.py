@@ -32,6 +32,7 @@ from analysis.records.findings import (
     trace_values,
 )
 from analysis.records.json_files import plain
+from analysis.records.provenance import Provenance
 from analysis.records.quantities import exponent_of, limits, measured, percent, quantity, ratio, unit_suffix
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map
@@ -113,7 +114,7 @@ def render_report(record: Record[ProbeRecord]) -> str:
     return template.render(
         data=data,
         counts=plain(data.counts),
-        provenance=plain(data.provenance),
+        provenance=_told(data.provenance),
         subtitle=subtitle(data),
         numbers=numbers(data, mapped),
         headline=first,
@@ -131,6 +132,14 @@ def render_report(record: Record[ProbeRecord]) -> str:
         surface=surface,
         plotly_js=packed.result() if packed else "",
     )
+
+
+def _told(made: Provenance) -> dict[str, Any]:
+    """Provenance as plain types; of the views, of which there may be hundreds, the digest."""
+    told = plain(made)
+    if made.fingerprint:
+        told["fingerprint"] |= {"data": made.fingerprint.digests["data"]}
+    return told
 
 
 def title(data: ProbeRecord) -> str:
@@ -220,13 +229,13 @@ def _steepest_attribute(data: ProbeRecord) -> list[dict[str, str]]:
 
 
 def map_beside(record: Record[ProbeRecord]) -> MapRecord | None:
-    """The map beside the record, if it is of the same training step."""
+    """The map beside the record, if it is of the same checkpoint, views and loss."""
     folder = record.folder.parent / MAP
     if not (folder / MapRecord.FILE).is_file():
         return None
-    found = read_map(folder)
-    same = plain(found.provenance).get("iteration") == plain(record.data.provenance).get("iteration")
-    return found if same else None
+    found, made = read_map(folder), record.data.provenance.fingerprint
+    about = found.provenance.fingerprint
+    return found if made and about and not made.apart_from(about) else None
 
 
 def views_in(record: Record[ProbeRecord], mapped: MapRecord | None) -> list[dict[str, Any]]:

@@ -21,6 +21,7 @@ from analysis.records.provenance import Machine, Provenance
 from analysis.records.quantities import Shade
 from analysis.records.schema import INDICES, Count, Number
 from landscape.errors import InputError
+from splat.training.origin.fingerprint import Fingerprint
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,11 +68,12 @@ class Clock(Struct, kw_only=True):
 
 
 class Made(Struct, kw_only=True):
-    """Time, machine and code, as in `Provenance`."""
+    """Time, machine, code, and what the numbers are about, as in `Provenance`."""
 
     created: str = ""
     machine: Machine | None = None
     commit: str | None = None
+    fingerprint: Fingerprint | None = None
 
 
 class Scores(Struct, kw_only=True):
@@ -95,9 +97,10 @@ class Seconds(Struct, kw_only=True):
 
 
 class Comparison(Struct, kw_only=True):
-    """runs: label -> folder of the run's record."""
+    """runs: label -> folder of the run's record; fingerprints: of the records when they were compared."""
 
     runs: dict[str, str]
+    fingerprints: dict[str, Fingerprint] = {}
 
 
 class Panel(Struct, kw_only=True):

@@ -20,7 +20,6 @@ from typing import Any
 from rich.console import Console
 
 from analysis.console.drawing import draw
-from analysis.console.overrides import leaves
 from analysis.console.plain import say
 from analysis.probe.record import loss_name
 from analysis.records.findings import of_budgets, of_checks, unresolved
@@ -35,8 +34,10 @@ from analysis.runs.options import CompareOptions
 from analysis.runs.seeds import Group, grouped, groups_of, identical, sayings
 from landscape.errors import InputError
 from splat.training.checkpoint import Checkpoint, write_atomically
+from splat.training.origin.fingerprint import changes, in_short
 
 PAGE, TABLE = "compare.html", "compare.csv"
+ASKED = ("settings.", "seed", "objective.of")  # of the question: cautions have its other parts
 PICTURES = {
     "compare_traces": "Traces by attribute, with their intervals. Filled: positive; open: negative; crossed: not decided.",
     "compare_densities": "How many directions are at least so curved, down (left) and up (right). Thin: each start "
@@ -59,20 +60,31 @@ def run_compare(options: CompareOptions) -> int:
     of_training = [checkpoint.training.config.loss for checkpoint in checkpoints]
     loss = "training" if of_training == of_training[:1] * len(of_training) else "3dgs"
     missing = [path for path, checkpoint in zip(paths, checkpoints) if not probed(path, checkpoint)]
+    others = [path for path in missing if (probe_folder(path) / ProbeRecord.FILE).is_file()]
     if missing and not options.probe:
         again = "; ".join(probe_command(path, options, loss) for path in missing)
+        there = f", where {probe_folder(others[0])} is of another" if missing[0] in others else ""
         raise InputError(
-            f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
+            f"expected probed runs, got no record of the checkpoint in {missing[0]}{there}; run {again}, or add --probe"
         )
+    notes = [
+        f"{probe_folder(path)} was of another checkpoint or renderer, and has been measured anew" for path in others
+    ]
     for path in missing:
         probe(path, options, loss)
     runs = [
-        Run(path, label, checkpoint, scores_of(path), read_record(probe_folder(path), ProbeRecord).data)
+        Run(
+            path,
+            label,
+            checkpoint,
+            scores_of(path, checkpoint, notes),
+            read_record(probe_folder(path), ProbeRecord).data,
+        )
         for path, label, checkpoint in zip(paths, labels, checkpoints)
     ]
     require_same_loss(runs)
     named = [_relative(group, common) for group in groups]
-    _write(runs, named, identical(labels, checkpoints), options.out or common / "compare")
+    _write(runs, named, identical(labels, checkpoints), notes, options.out or common / "compare")
     return 0
 
 
@@ -140,15 +152,7 @@ def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
              if any(of(run) != of(runs[0]) for run in runs) and not (seeds and what == "seed")]  # fmt: skip
     if len({row.unit for run in runs for row in run.data.families or ()}) > 1:
         lines.append("The units of the families are not the same.")
-    found = [leaves(run.data.provenance.settings or {}) for run in runs]
-    different = [
-        f"{name} {', '.join(str(settings.get(name)) for settings in found)}"
-        for name in dict.fromkeys(name for settings in found for name in settings)
-        if any(settings.get(name) != found[0].get(name) for settings in found)
-    ]
-    if different:
-        order = ", ".join(run.label for run in runs)
-        lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
+    lines += _apart(runs)
     said: list[tuple[Run, str]] = []
     for run in runs:
         if run.data.slice and not run.data.slice.is_resolved:
@@ -165,6 +169,31 @@ def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
                 f"landscape probe {shlex.quote(str(checkpoint_path(run.folder)))} --split-control" for run in without
             )
         )
+    return lines
+
+
+def _apart(runs: Sequence[Run]) -> list[str]:
+    """What differs between the probes, part by part of their fingerprints: views, settings, formulas."""
+    found = [made for run in runs if (made := run.data.provenance.fingerprint)]
+    lines = []
+    for run, made in zip(runs, found, strict=True):
+        trained = {name: run.checkpoint.scene.views[name] for name in made.data}
+        for words, views in (("of its training", trained), (f"of {runs[0].label}", found[0].data)):
+            if moved := changes({name: view for name, view in views.items() if name in made.data}, made.data):
+                lines.append(f"The views of {run.label}'s probe are not those {words}: {in_short(moved)}.")
+    asked = [
+        {k.removeprefix("settings."): v for k, v in each.question.items() if k.startswith(ASKED)} for each in found
+    ]
+    different = [
+        f"{name} {', '.join(str(settings.get(name)) for settings in asked)}"
+        for name in dict.fromkeys(name for settings in asked for name in settings)
+        if any(settings.get(name) != asked[0].get(name) for settings in asked)
+    ]
+    if different:
+        order = ", ".join(run.label for run in runs)
+        lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
+    if len(versions := sorted({made.formulas for made in found})) > 1:
+        lines.append(f"The probes are of versions {', '.join(map(str, versions))} of the formulas: probe again.")
     return lines
 
 
@@ -196,10 +225,13 @@ def _once(lines: Sequence[tuple[Run, str]]) -> list[str]:
     ]
 
 
-def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], out: Path) -> None:
-    """Table, pictures, page; and what it says, the table and the cautions once more for the terminal."""
+def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], found: Sequence[str], out: Path) -> None:
+    """Table, pictures, page; and what it says, the table and the cautions once more for the terminal.
+
+    found: the cautions so far.
+    """
     console, labels = Console(), [run.label for run in runs]
-    rows, notes = comparison(runs), cautions(runs, any(len(group.folders) > 1 for group in groups))
+    rows, notes = comparison(runs), [*found, *cautions(runs, any(len(group.folders) > 1 for group in groups))]
     shown = grouped(rows, groups)
     says = [*same, *sayings(shown, groups)]
     shown_runs = {folder: group.label for group in groups for folder in group.folders[:1]}
@@ -207,7 +239,11 @@ def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], ou
         notes.append(f"The pictures show the first run of each group: {', '.join(map(str, shown_runs))}.")
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode(errors="backslashreplace"))
-    index = Comparison(runs={label: str(probe_folder(folder).resolve()) for folder, label in shown_runs.items()})
+    made = {run.folder: run.data.provenance.fingerprint for run in runs}
+    index = Comparison(
+        runs={label: str(probe_folder(folder).resolve()) for folder, label in shown_runs.items()},
+        fingerprints={label: of for folder, label in shown_runs.items() if (of := made[folder])},
+    )
     write_atomically(out / COMPARISON, json_text(plain(index)).encode())
     for name in PICTURES:  # of an earlier comparison, which may show what this one has no numbers for
         (out / f"{name}.png").unlink(missing_ok=True)

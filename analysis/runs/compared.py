@@ -14,15 +14,18 @@ from msgspec import UNSET
 from analysis.console.options import ForeignOptions
 from analysis.probe.command import opened, run_probe
 from analysis.probe.options import ProbeOptions
-from analysis.records.provenance import Provenance
+from analysis.records.provenance import Provenance, require_own
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS, Scores, read_scores
 from analysis.runs.options import CompareOptions
 from analysis.runs.sweep.sweep_file import arguments
+from landscape.errors import InputError
 from splat.training.checkpoint import Checkpoint, load_checkpoint, open_checkpoint
+from splat.training.origin.fingerprint import changes
 from splat.training.origin.foreign import Foreign
 
-PROBE = "probe"
+PROBE, RENDER = "probe", ("objective.render.", "objective.similarity", "objective.centred", "objective.background")
+AGAIN = "repeat the training's command with --resume, which scores again"
 Loss = Literal["training", "3dgs"]
 
 
@@ -70,14 +73,19 @@ def _as_probed(made: Provenance) -> Foreign:
 
 
 def probed(run: Path, checkpoint: Checkpoint) -> bool:
-    """Whether there is a record of this checkpoint's step; of a file, also by its trainer's conventions, of its views."""
+    """Whether there is a record of this checkpoint, by its renderer, of its views or some of them.
+
+    The loss is compared between the records (`require_same_loss`).
+    """
     made = _made(probe_folder(run))
-    if made is None or made.iteration != checkpoint.training.step:
+    if made is None or not made.fingerprint:
         return False
-    if checkpoint.origin is None:
-        return True
-    alike = made.origin is not UNSET and made.origin["trained_by"] == checkpoint.origin["trained_by"]
-    return alike and {*(made.views or ())} <= {*checkpoint.scene.train}
+    found, asked = made.fingerprint, checkpoint.fingerprint({}, 0)
+    renders = [{k: v for k, v in each.question.items() if k.startswith(RENDER)} for each in (found, asked)]
+    if found.state != asked.state or renders[0] != renders[1] or not found.data.keys() <= asked.data.keys():
+        return False
+    # of another tool's file the views are those of today, of a training its own: what was accepted is said of it
+    return checkpoint.origin is None or not changes({name: asked.data[name] for name in found.data}, found.data)
 
 
 def _probing(run: Path, options: CompareOptions, loss: Loss) -> ProbeOptions:
@@ -98,6 +106,17 @@ def probe(run: Path, options: CompareOptions, loss: Loss) -> None:
     run_probe(asked, ["landscape", *arguments("probe", asked)])
 
 
-def scores_of(run: Path) -> Scores | None:
-    """Scores of a run; None where it was stopped before, or is another tool's file."""
-    return read_scores(run) if (run / METRICS).is_file() else None
+def scores_of(run: Path, checkpoint: Checkpoint, notes: list[str]) -> Scores | None:
+    """Scores of the checkpoint; None where a run was stopped before, or is another tool's file.
+
+    notes: is told of scores that are another checkpoint's, which are left out.
+    """
+    if not (run / METRICS).is_file():
+        return None
+    found = read_scores(run)
+    try:
+        require_own(found.provenance and found.provenance.fingerprint, checkpoint.state, run / METRICS, AGAIN)
+    except InputError as error:
+        notes.append(f"scores are left out: {error}")
+        return None
+    return found

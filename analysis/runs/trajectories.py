@@ -42,6 +42,8 @@ def run_trajectory(options: TrajectoryOptions) -> int:
     with replacing(path) as partial:
         table.to_csv(partial, index=False, errors="backslashreplace")
     console.print(first_and_last(table))
+    if len(versions := table.filter(["of_formulas"]).dropna().drop_duplicates()) > 1:
+        say(f"records of {len(versions)} versions of the formulas do not compare: train again", style="yellow")
     (out / PICTURE).unlink(missing_ok=True)
     say(*draw("trajectory", path), style="yellow", console=console)
     drawn = f"picture: {out / PICTURE}; " if (out / PICTURE).is_file() else ""

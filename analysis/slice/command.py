@@ -14,9 +14,11 @@ import io
 import shlex
 import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from math import inf
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,6 +61,7 @@ from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
 from splat.model.untrusted import read_array
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
+from splat.training.origin.fingerprint import Fingerprint, state_of
 
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
@@ -84,26 +87,33 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
         others = [_other_end(checkpoint, path) for path in options.others]
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
         expected_peak(objective)  # raises MemoryError where it cannot fit
+        ends = [state_of(checkpoint.training.gaussians.with_flat(other), 0) for other in others]
+        made = checkpoint.fingerprint(_asked(options, settings) | {"others": ends}, options.seed)
     # the folder is opened first, so that one that cannot be written is refused before anything is rendered
     with record_folder(out, SliceRecord.FILE) as folder, stages, telling_needs(objective):
         notes: list[str] = []
-        known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
+        kept = unfinished / made.but("settings", "seed").digest  # the points have a digest of their own
+        known = _known(options.checkpoint.parent / "probe", kept, made, objective.active.flat.device, notes)
         try:
-            found = _measure(
-                objective, shape, others, known, settings, options, unfinished, stages, checkpoint.all_views
-            )
+            found = _measure(objective, shape, others, known, settings, options, kept, stages, checkpoint.all_views)
         except BaseException:
             if unfinished.is_dir():
                 say(f"what was rendered is kept; to continue: {shlex.join(command)}", console=console)
             raise
-        made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
-        made.other = ", ".join(map(str, options.others)) or None
-        data = slice_record(found, objective, notes + checkpoint.assumptions, made)
+        origin = provenance_of(made, options.checkpoint, command, checkpoint, scene)
+        origin.other = ", ".join(map(str, options.others)) or None
+        data = slice_record(found, objective, notes + checkpoint.assumptions, origin)
         objective.release()  # for the memory of the processes that draw
         write_with_pictures(folder, data, slice_arrays(found), stages, start)
     shutil.rmtree(unfinished, ignore_errors=True)
     _conclude(data, out)
     return 0
+
+
+def _asked(options: SliceOptions, settings: SliceSettings) -> dict[str, Any]:
+    """What changes the numbers; how many renders are made at a time does not."""
+    amounts = {name: value for name, value in asdict(settings).items() if name != "workers"}
+    return amounts | {name: getattr(options, name) for name in ("along", "dimension", "radius", "points")}
 
 
 def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
@@ -143,19 +153,19 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     return there.aligned_to(here).flat
 
 
-def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list[str]) -> list[Tensor]:
+def _known(probe: Path, unfinished: Path, made: Fingerprint, device: torch.device, notes: list[str]) -> list[Tensor]:
     """Eigenvectors of an interrupted run and of the probe.  notes: gets a sentence on those that cannot be read."""
     kept, found = unfinished / "eigenvectors.npy", []
     if kept.is_file():
         try:
             with kept.open("rb") as stream, refusing_damage("eigenvectors", kept, "they were computed again"):
                 vectors = torch.from_numpy(read_array(stream))
-            found.append(vectors.to(objective.active.flat.device))
+            found.append(vectors.to(device))
         except InputError as error:
             notes.append(str(error))
-    if recorded := recorded_probe(probe, objective, notes):
+    if recorded := recorded_probe(probe, made, notes):
         vectors = torch.from_numpy(recorded.arrays["eigenvectors"]["largest"])
-        found.append(vectors.to(objective.active.flat.device))
+        found.append(vectors.to(device))
     return found
 
 

@@ -16,14 +16,12 @@ falling.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isclose
 from pathlib import Path
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from analysis.probe.record import loss_name
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.slice.options import Along
 from landscape import (
@@ -40,8 +38,8 @@ from landscape import (
 from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
 from landscape.results import Progress
-from landscape.slices.grid_evaluations import SAME_LOSS
 from splat.curvature.objective import SceneObjective
+from splat.training.origin.fingerprint import Fingerprint
 
 RISE = 0.001  # of the loss, within a curvature unit
 UNITS = 3.0  # default radii: in curvature units, ...
@@ -214,10 +212,11 @@ def _measured(
     return values, (product - values * exact).norm(dim=0)
 
 
-def recorded_probe(folder: Path, objective: SceneObjective, notes: list[str]) -> Record[ProbeRecord] | None:
-    """The probe recorded in a folder, if any, where it is of this objective's Hessian and has its eigenvectors.
+def recorded_probe(folder: Path, asked: Fingerprint, notes: list[str]) -> Record[ProbeRecord] | None:
+    """The probe recorded in a folder, if any, where it is of the checkpoint, the views and the loss that are asked for, and has
+    its eigenvectors.
 
-    notes: is told where there is a record that cannot be read.
+    notes: is told where there is a record that cannot be read, or one of another.
     """
     if not (folder / ProbeRecord.FILE).is_file():
         return None
@@ -226,9 +225,8 @@ def recorded_probe(folder: Path, objective: SceneObjective, notes: list[str]) ->
     except (FileNotFoundError, InputError) as error:
         notes.append(f"eigenvectors were not taken from the probe: {error}")
         return None
-    about, center = record.data.objective, objective.active.flat
-    same = (about.loss, about.operator) == (loss_name(objective.loss_settings), "hessian") and about.value is not None
-    tolerance = SAME_LOSS * torch.finfo(center.dtype).eps
-    if not same or not isclose(about.value or 0.0, objective.loss(center), rel_tol=tolerance):
+    found = record.data.provenance.fingerprint
+    if apart := asked.apart_from(found) if found else "origin":
+        notes.append(f"eigenvectors were not taken from {folder}: it is a probe of another {apart}; probe again")
         return None
     return record if "largest" in record.arrays.get("eigenvectors", {}) else None

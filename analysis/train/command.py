@@ -49,11 +49,12 @@ from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, read_names, split_scene, usual_views
 from splat.scenes.view import View
-from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
+from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
 from splat.training.densify import DensifySettings
 from splat.training.loop import prepare, train
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
+from splat.training.origin.fingerprint import Fingerprint
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.score.evaluate import have_masks
 from splat.training.start import Source, initial_gaussians
@@ -85,6 +86,12 @@ class Run:
     held_out: list[View]
     reference: SceneReference
     keep: int | Literal["all"] = 0
+
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """What the numbers of the training as it stands are about, with those of its held-out views."""
+        tested = {name: self.reference.views[name] for name in self.reference.test}
+        return Checkpoint(self.training, self.reference).fingerprint({}, self.training.config.seed, further=tested)
 
     def create(self, *, keep_start: bool) -> None:
         """Create the folder with its first checkpoint, atomically.  keep_start: with a copy in START."""
@@ -145,7 +152,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     if options.depths:
         require_depths(views, options.depths)
     if options.resume:
-        training = resumed(out / CHECKPOINT, config, reference)
+        training = resumed(out / CHECKPOINT, config, reference).training
     else:
         generator = torch.Generator().manual_seed(config.seed)
         if given is None:
@@ -171,14 +178,14 @@ def _run(run: Run, options: TrainOptions, command: Sequence[str], along: Traject
     begun = None if options.resume or options.from_ else (run.reference.start, len(training.gaussians))
     settings = _asked(options, run.scene), _config(options, run.scene)
     say(*remarks(run.scene, *settings, begun, training, run.views[0]), style="yellow", console=console)
-    trajectory = None if along is None else Trajectory(run.out, training, run.views, along)
+    trajectory = None if along is None else Trajectory(run.out, training, run.views, along, run.reference)
     if code := _follow(run, options, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])
         say(f"stopped after step {training.step}; to continue: {again}", console=console)
         return code
-    report(training, run.views, run.held_out, run.out)
-    if trajectory and (thinned := trajectory.thinned):
-        say(thinned, style="yellow", console=console)
+    report(training, run.views, run.held_out, run.out, run.fingerprint)
+    if trajectory:
+        say(*filter(None, (trajectory.thinned, trajectory.mixed)), style="yellow", console=console)
     return 0
 
 
@@ -192,7 +199,7 @@ def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig
     split = _split(options, scene)
     start = typed(Source, options.start or preset.get("start", "scene"), "start")
     reference = SceneReference.to(
-        scene, out / CHECKPOINT, split, options.images, options.downscale, start, options.depths
+        scene, out / CHECKPOINT, split, options.images, options.downscale, start, options.depths, options.masks
     )
     return scene, split, _config(options, scene), reference
 
@@ -252,12 +259,12 @@ def _require_run(out: Path, resume: bool) -> None:
         )
 
 
-def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: str = AGAIN) -> Training:
-    """The training of a checkpoint.  Raises InputError, with this remedy, unless it has the same settings and views."""
+def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: str = AGAIN) -> Checkpoint:
+    """The checkpoint at a path.  Raises InputError, with this remedy, unless it has the same settings and views."""
     loaded = load_checkpoint(path)
 
     def settings(of: TrainConfig, scene: SceneReference) -> dict[str, Any]:
-        return leaves(asdict(of)) | leaves(asdict(replace(scene, absolute="", relative="", photographs=None)))
+        return leaves(asdict(of)) | leaves(asdict(replace(scene, absolute="", relative="", views={})))
 
     asked, saved = settings(config, reference), settings(loaded.training.config, loaded.scene)
     for key, value in saved.items():
@@ -266,8 +273,8 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: 
                 f"expected the settings that the run in {path.parent} was started with, {key} = {value}, got "
                 f"{asked[key]}; {remedy}"
             )
-    loaded.scene.require_photographs(reference.photographs, Path(reference.absolute))
-    return loaded.training
+    loaded.scene.require_unchanged(reference.views, reference.absolute)
+    return loaded
 
 
 def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, console: Console) -> int:

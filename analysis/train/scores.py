@@ -30,6 +30,7 @@ from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.view import View
 from splat.scenes.write import bytes_of, png
 from splat.training.checkpoint import write_atomically
+from splat.training.origin.fingerprint import Fingerprint
 from splat.training.score.evaluate import Evaluation, ViewScore, evaluate
 from splat.training.score.perceptual import MissingPerceptual, load_lpips
 from splat.training.state import Training
@@ -39,8 +40,8 @@ ERROR_SHOWN = 0.25  # of the range of a colour
 GAP = 4  # white pixels between the pictures of a panel
 
 
-def report(training: Training, views: Sequence[View], held_out: Sequence[View], out: Path) -> None:
-    """Score the views, write renders, panels and metrics, print the table."""
+def report(training: Training, views: Sequence[View], held_out: Sequence[View], out: Path, made: Fingerprint) -> None:
+    """Score the views, write renders, panels and metrics, print the table.  made: what the scores are about."""
     config = training.config
     background = config.background_colour(training.gaussians.flat.dtype)
     renders, photographs = out / RENDERS, {view.name: view for view in held_out}
@@ -69,7 +70,7 @@ def report(training: Training, views: Sequence[View], held_out: Sequence[View], 
         "train": _scores(seen),
         "test": _scores(tested) if tested else None,
         "seconds": asdict(TrainingTime.read(out)),
-        "provenance": plain(provenance(config.seed, checkpoint=str(out / CHECKPOINT))),
+        "provenance": plain(provenance(config.seed, checkpoint=str(out / CHECKPOINT), fingerprint=made)),
     }
     write_atomically(out / METRICS, json_text(metrics).encode())
     console.print(_table(seen, tested))

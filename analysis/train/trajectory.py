@@ -26,10 +26,11 @@ Columns:
     lambda_max, lambda_min    with _error (residual) and _reason (why the search ended)
     literal, saddle, share, effective_rank, mass_quantile    indices (`landscape.spectrum.anisotropy`), with _low and _high; the
                            last three of whole records, which have a spectral density
+    of_data, of_question, of_state, of_formulas    digests of what the record is about (`splat.training.origin.fingerprint`)
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from math import isinf
 from pathlib import Path
 from time import perf_counter
@@ -63,7 +64,8 @@ from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, block_traces, exact_traces
 from splat.model.gaussians import ATTRIBUTES
 from splat.scenes.view import View
-from splat.training.checkpoint import write_atomically
+from splat.training.checkpoint import Checkpoint, write_atomically
+from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import Training
 
 START = "start"
@@ -78,6 +80,7 @@ COLUMNS = (
     *(f"trace_{name}{key}" for name in ATTRIBUTES for key in ("", "_error", "_low", "_high", "_dim", "_reason")),
     *(f"lambda_{end}{key}" for end in ("max", "min") for key in ("", "_error", "_reason")),
     *(f"{index}{key}" for index in INDICES for key in ("", "_low", "_high")),
+    *(f"of_{part}" for part in ("data", "question", "state", "formulas")),
 )  # fmt: skip
 
 
@@ -115,8 +118,15 @@ class Found:
 class Trajectory:
     """The records of one run.  Reads those of an interrupted run, up to the training's step."""
 
-    def __init__(self, run: Path, training: Training, views: Sequence[View], settings: TrajectorySettings) -> None:
-        self.run, self.training, self.views, self.settings = run, training, views, settings
+    def __init__(
+        self,
+        run: Path,
+        training: Training,
+        views: Sequence[View],
+        settings: TrajectorySettings,
+        reference: SceneReference,
+    ) -> None:
+        self.run, self.training, self.views, self.settings, self.reference = run, training, views, settings, reference
         self.rows = _read_rows(run / RECORDS, training.step)
         self.taken: dict[Level, tuple[float, int]] = {}  # seconds of the last record, with how many Gaussians
         self.pace = _compile(training, views)
@@ -153,6 +163,7 @@ class Trajectory:
             if row["state"] == level:
                 self.taken[level] = row["seconds"], len(self.training.gaussians)
         row["time_share"] = (spent + row["seconds"]) / trained if trained else None
+        row |= self._about()
         self.rows.append(row)
         # dtype object keeps integers in a column with gaps, as they are in rows that were read
         table = pd.DataFrame(self.rows, columns=COLUMNS, dtype=object)
@@ -169,6 +180,21 @@ class Trajectory:
         why = others[-1] if others else f"they may take {self.settings.share:g} of the time of the steps"
         remedy = "" if others else "; --probe-share inf sets no limit to their time"
         return f"of {len(self.rows)} records of the landscape, {said} ({why}){remedy}"
+
+    @property
+    def mixed(self) -> str:
+        """Sentence on records of other data, questions or formulas than those of today; empty without any."""
+        about = {name: str(value) for name, value in self._about().items() if name != "of_state"}
+        others = [row["step"] for row in self.rows if any(str(row.get(name)) != about[name] for name in about)]
+        if not others:
+            return ""
+        steps = ", ".join(map(str, others))
+        return f"records of step {steps} are of other views, settings or formulas than today's, and do not compare"
+
+    def _about(self) -> Row:
+        settings = asdict(replace(self.settings, every=1, share=1.0))  # which change no number
+        made = Checkpoint(self.training, self.reference).fingerprint(settings, self.training.config.seed)
+        return {f"of_{name}": value for name, value in made.digests.items()}
 
     def _expected(self, level: Level) -> float:
         """Expected seconds of a record: from the last ones, else from the time of a step."""

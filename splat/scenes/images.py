@@ -182,7 +182,9 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
     view = partial(_view, photo, turned, camera, warp, background)
     layers = {"alpha": transparent, "mask": photo.mask, "depth": photo.depth}
     named = frozenset(name for name, there in layers.items() if there)
-    return Frame(photo.name, camera, view, photo.subset, photo.depth_range, photo.path, named)
+    distortion = "" if pinhole is lens else f"{lens.model_name} {', '.join(f'{value:.12g}' for value in lens.params)}"
+    files = photo.path, named, distortion, photo.mask, photo.depth
+    return Frame(photo.name, camera, view, photo.subset, photo.depth_range, *files)
 
 
 def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> pycolmap.Camera:
@@ -263,7 +265,10 @@ def _view(photo: Photo, turned: bool, camera: Camera, warp: Warp, background: Fl
 def _at_size(layers: Float[Tensor, "c h w"], size: tuple[int, int], path: Path) -> Tensor:
     """A mask or depth map at the size of its photograph, whose shape it must have."""
     height, width = layers.shape[1:]
-    if not _same_shape((width, height), size):
+    made = (width, height)
+    if not (
+        _same_shape(made, size) or _same_shape(size, made)
+    ):  # the rounding is of the one that was made of the other
         raise InputError(
             f"expected {path} to have the shape of its photograph, {size[0]} x {size[1]} px at any scale, got "
             f"{width} x {height}; make it from that photograph"

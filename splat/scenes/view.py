@@ -12,7 +12,6 @@ background where the file has an alpha channel.  World units and axes are those 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from hashlib import blake2b
 from pathlib import Path
 from threading import Lock
 from typing import Any, Literal
@@ -68,7 +67,8 @@ class Frame:
 
     subset: the part that the scene's own files assign it to.  depth_range: nearest and farthest depth of the scene
     content, world units.  None where the files do not say.  path: of the picture, None where it is not on disk.
-    layers: which of alpha, mask and depth its view has.
+    layers: which of alpha, mask and depth its view has; mask, depth: the files.  distortion: model and parameters of its lens,
+    where that was no pinhole.
     """
 
     name: str
@@ -78,6 +78,9 @@ class Frame:
     depth_range: tuple[float, float] | None = None
     path: Path | None = None
     layers: frozenset[str] = frozenset()
+    distortion: str = ""
+    mask: Path | None = None
+    depth: Path | None = None
 
     @property
     def bytes(self) -> int:
@@ -117,14 +120,6 @@ class Photograph(View):
             return object.__getattribute__(self, name)
         frame: Frame = self._frame  # pyright: ignore[reportAttributeAccessIssue]
         return getattr(self._shelf.view(frame), name) if name == "image" or name in frame.layers else None  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def digests(frames: Sequence[Frame]) -> list[str] | None:
-    """Digest of each picture's file; None where one is not on disk."""
-    paths = [frame.path for frame in frames if frame.path is not None]
-    if len(paths) < len(frames):
-        return None
-    return [blake2b(path.read_bytes(), digest_size=8).hexdigest() for path in paths]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,11 @@ which torch omits.  The same training gives the same bytes.
 
 import errno
 import io
+import json
 import sys
 import warnings
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from math import inf
 from pathlib import Path
@@ -20,6 +22,7 @@ from torch import Tensor
 
 from landscape.errors import InputError, did_you_mean, lacks_memory
 from landscape.results import Brief
+from splat.losses.reference import LossSettings
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.settings import current_settings
@@ -30,11 +33,13 @@ from splat.scenes.splits import spread_views
 from splat.training.adam import Adam
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
+from splat.training.origin.fingerprint import Fingerprint, ViewData, changes, state_of
 from splat.training.origin.foreign import Foreign, foreign_training
-from splat.training.origin.scene_reference import SceneReference
-from splat.training.state import Method, ThreeDGS, TrainConfig, Training
+from splat.training.origin.frames import posed
+from splat.training.origin.scene_reference import SceneReference, data_of
+from splat.training.state import Method, TrainConfig, Training
 
-FORMAT, VERSION = "splat-landscape checkpoint", 2
+FORMAT, VERSION = "splat-landscape checkpoint", 3
 KIND = "expected a checkpoint written by landscape train"
 # settings that older files may lack: those trainings had what are now the defaults
 LATER = {
@@ -56,36 +61,80 @@ class Checkpoint(Brief):
     """A saved training and its scene.
 
     origin: what was assumed of another tool's file (`foreign_training`).  all_views: number of views that it was trained on,
-    where the scene names fewer (`thinned`).
+    where the scene names fewer (`thinned`).  changed: what is not as it was in the training, where that was accepted.
     """
 
     training: Training
     scene: SceneReference
     origin: dict[str, Any] | None = None
     all_views: int | None = None
+    changed: tuple[str, ...] = ()
 
     @property
     def assumptions(self) -> list[str]:
-        """Sentences on what was assumed of another tool's file."""
+        """Sentences on what was assumed of another tool's file, and on what was accepted."""
+        changed = [f"not as in the training, and accepted: {each}" for each in self.changed]
         if self.origin is None:
-            return []
+            return changed
         summary = "trained by {trained_by} ({trained_by_source}), training views: {views}; {psnr:.1f} dB on two of them"
-        return [summary.format(**self.origin), *self.origin["notes"]]
+        return [summary.format(**self.origin), *self.origin["notes"], *changed]
+
+    @property
+    def state(self) -> str:
+        """Digest of the Gaussians, by which records are known to be its own."""
+        return state_of(self.training.gaussians, self.training.step)
+
+    def fingerprint(
+        self,
+        settings: Mapping[str, Any],
+        seed: int,
+        loss: LossSettings | None = None,
+        further: Mapping[str, ViewData] | None = None,
+    ) -> Fingerprint:
+        """What numbers of this checkpoint are about.
+
+        settings: of the command, that change them.  loss: the training's by default.  further: views beside the training's.
+        """
+        config, scene, gaussians = self.training.config, self.scene, self.training.gaussians
+        rounded = None if scene.similarity is None else [f"{value:.9g}" for row in scene.similarity for value in row]
+        objective = {
+            "loss": asdict(loss or config.loss),
+            "render": asdict(config.render),
+            "background": config.background,
+        }
+        objective |= {"views": scene.train, "of": self.all_views or len(scene.train)}
+        objective |= {"similarity": rounded, "centred": scene.centred, "dtype": str(gaussians.flat.dtype)}
+        trained = asdict(config) | {"extent": f"{self.training.extent:.9g}"}
+        question = leaves({"objective": objective, "training": trained, "settings": dict(settings), "seed": seed})
+        data = {name: scene.views[name] for name in scene.train} | dict(further or {})
+        return Fingerprint(data, json.loads(json.dumps(question, default=str)), self.state)  # as it is read again
 
     def thinned(self, scene: Scene, count: int | None) -> "Checkpoint":
         """The same with at most `count` of its training views, spread evenly over their cameras; None: all."""
         if count is None or count >= len(self.scene.train):
             return self
         chosen = set(spread_views(scene.select(self.scene.train), count))
-        kept = [i for i, name in enumerate(self.scene.train) if name in chosen]
-        train, sizes = [self.scene.train[i] for i in kept], [self.scene.sizes[i] for i in kept]
-        known = self.scene.photographs and [self.scene.photographs[i] for i in kept]
-        scene_of_these = replace(self.scene, train=train, sizes=sizes, photographs=known)
-        return replace(self, scene=scene_of_these, all_views=self.all_views or len(self.scene.train))
+        train = [name for name in self.scene.train if name in chosen]
+        return replace(self, scene=replace(self.scene, train=train), all_views=self.all_views or len(self.scene.train))
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
-        """The scene of this checkpoint, which was read from path; see `SceneReference.load`."""
-        return self.scene.load(path, self.training.config.background, scene)
+        """The scene of this checkpoint, which was read from path; see `with_scene`."""
+        return self.with_scene(path, scene)[1]
+
+    def with_scene(self, path: Path, folder: Path | None = None, *, accept: bool = False) -> tuple["Checkpoint", Scene]:
+        """The checkpoint with the views as they are now, and its scene, in the world of the Gaussians.
+
+        `scene.load(checkpoint.scene.train)` then gives the training views.  InputError that says what has changed since the
+        training, unless that is accepted; and as `SceneReference.load`.
+        """
+        reference = self.scene
+        scene = reference.load(path, self.training.config.background, folder)
+        now = data_of(scene, list(reference.views))
+        changed = tuple(changes(reference.views, now))
+        if not accept:
+            reference.require_unchanged(now, scene.root, "restore them, train anew, or go on with --accept-changed")
+        checkpoint = replace(self, scene=replace(reference, views=now), changed=changed)
+        return checkpoint, posed(scene, reference.similarity, centred=reference.centred)
 
 
 @dataclass(frozen=True)
@@ -132,8 +181,7 @@ class _Training:
 class _File:
     """The keys beside those of the training.
 
-    version: of the format; 1 is 3DGS without `regularizer`, from before there were methods.  torch: the version that wrote the
-    file.  scene: `SceneReference` as plain types.
+    version: of the format.  torch: the version that wrote the file.  scene: `SceneReference` as plain types.
     """
 
     format: str
@@ -266,17 +314,12 @@ def _checkpoint(content: Any) -> Checkpoint:
     """The checkpoint with this content.  InputError that says what is wrong with it."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"it does not hold the format {FORMAT!r}")
+    if (version := typed(Count, content.get("version"), "format version")) != VERSION:
+        raise InputError(f"its format version is {version}, this program reads {VERSION}")
     file = typed(_File, content)
-    if file.version not in (1, VERSION):
-        raise InputError(f"its format version is {file.version}, this program reads up to {VERSION}")
-    if file.version == 1:
-        method, config = ThreeDGS(), typed(dict[str, Any], content.get("config"), "config")
-        content = {**content, "config": {**config, "method": asdict(method)}, "regularizer": method.create(0).state()}
     training, scene = restored_training(content), file.scene
-    for each in ("sizes", "photographs"):
-        found = getattr(scene, each)
-        if found is not None and len(found) != len(scene.train):
-            raise InputError(f"it has {len(found)} {each} for {len(scene.train)} training views")
+    if unseen := [name for name in (*scene.train, *scene.test) if name not in scene.views]:
+        raise InputError(f"it does not say what was seen of {len(unseen)} of its views, such as {unseen[0][:80]!r}")
     if not all(index < len(scene.train) for index in training.order):
         raise InputError(f"its order does not index its {len(scene.train)} training views")
     return Checkpoint(training, scene)

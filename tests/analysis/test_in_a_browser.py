@@ -16,8 +16,11 @@ from analysis.commands.view import viewer as view
 from analysis.commands.view.page import offline_page
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.training.origin.fingerprint import Fingerprint
 from tests.analysis.records.test_report import with_views
 from tests.browser import chromium, errors_in, requests_of, until
+
+NOTHING = Fingerprint({}, {}, "")
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +72,7 @@ def viewer() -> Iterator[view.Viewer]:
     objective = SceneObjective(made.truth, made.scene.load())
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     found = view.Viewer(server, objective, 1)
-    found.add_fields(measured_fields(objective, Path("nowhere"), [], lambda *_: None), "largest")
+    found.add_fields(measured_fields(objective, Path("nowhere"), NOTHING, [], lambda *_: None), "largest")
     direction = torch.zeros_like(objective.active.flat)
     direction[objective.blocks["sh"]] = 1.0
     found.add_steps({"e₁": (direction, 0.05)})

@@ -9,14 +9,16 @@ from splat.model.settings import RenderSettings
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.densify import DensifySettings
+from splat.training.origin.fingerprint import ViewData
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig
 
 SMOOTH = RenderSettings(alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)  # no threshold that can be off
 WIDTH, HEIGHT, EXTENT = 20, 14, 2.0
-REFERENCE = SceneReference(
-    "/nowhere/tiny", "../tiny", None, 1.0, ["view0", "view1", "view2"], [], [[WIDTH, HEIGHT]] * 3
-)
+LEVEL = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+LENS, SIZE = (20.0, 20.0, WIDTH / 2, HEIGHT / 2), (WIDTH, HEIGHT)
+SEEN = {f"view{i}": ViewData(LEVEL, (0.4 * (i - 1), 0.1 * i, 0.0), LENS, SIZE) for i in range(3)}
+REFERENCE = SceneReference("/nowhere/tiny", "../tiny", None, 1.0, list(SEEN), [], SEEN)
 
 
 def tiny_gaussians(n: int = 12, seed: int = 0, sh_degree: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:

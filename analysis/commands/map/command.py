@@ -50,6 +50,7 @@ from splat.model.gaussians import Gaussians
 from splat.render.sight import Sight
 from splat.scenes.view import View
 from splat.training.checkpoint import Checkpoint
+from splat.training.origin.fingerprint import Fingerprint
 
 ENDS = {"e1": "e₁", "e_min": "eₘᵢₙ"}  # fields of a probe's eigenvectors: the share of each in a Gaussian
 AXES = ("order_gap", "condition", "one_view")  # of fragility
@@ -97,10 +98,11 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         objective = scene_objective(checkpoint, scene)
         chosen = _chosen(options.draw, objective.views)
+    made = checkpoint.fingerprint({"field": options.shown, "draw": options.draw}, options.seed)
     gaussians = checkpoint.training.gaussians
     with record_folder(out, MapRecord.FILE) as folder, stages, ThreadPoolExecutor(1) as beside:
         with stages.stage("fields") as report:
-            found = measured_fields(objective, probe, notes, report)
+            found = measured_fields(objective, probe, made, notes, report)
         if options.shown not in found.values:
             raise InputError(
                 f"expected a probe with eigenvectors of this checkpoint in {probe} for --field {options.shown}, got none; "
@@ -121,7 +123,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
             gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
             sentences=[f"{each.sentence} {each.rendered}" for each in shown] + fragility_sentences(fragile),
             steepest=shown, fragility=fragile, notes=notes + checkpoint.assumptions + _views_left_out(checkpoint),
-            provenance=provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene),
+            provenance=provenance_of(made, options.checkpoint, command, checkpoint, scene),
         )  # fmt: skip
         _write(folder, data)
         with stages.stage("pictures"):
@@ -153,10 +155,12 @@ def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
     return sorted({places[name] for name in names}) or [*range(len(views))]
 
 
-def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
-    """Fields of the blocks and the views, and masses in the eigenvectors of the probe, where that is of the same loss."""
+def measured_fields(
+    objective: SceneObjective, probe: Path, made: Fingerprint, notes: list[str], report: Progress
+) -> Fields:
+    """Fields of the blocks and the views, and masses in the eigenvectors of the probe, where that is of what is asked for."""
     values, sights = scene_fields(objective, report)
-    ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, objective, notes)
+    ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, made, notes)
     if recorded is not None:
         about, vectors = recorded.data.eigenvalues, recorded.arrays["eigenvectors"]
         known = {

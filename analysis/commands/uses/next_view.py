@@ -31,6 +31,7 @@ from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint
+from splat.training.origin.scene_reference import data_of
 
 RECORD = "next-view.json"  # the file by which a folder of results is known
 
@@ -61,7 +62,8 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
                 table.loc[name, "pick"] = place + 1
             table = table.sort_values(["pick", options.by], ascending=[True, False])
             table.to_csv(folder / "gains.csv")
-        made = provenance_of(0, options.checkpoint, command, options, checkpoint, scene)
+        judged = checkpoint.fingerprint({"take": options.take, "by": options.by}, 0, further=data_of(scene, candidates))
+        made = provenance_of(judged, options.checkpoint, command, checkpoint, scene)
         (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     _conclude(table, options, out)

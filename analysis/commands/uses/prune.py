@@ -14,7 +14,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +53,7 @@ L2 = LossSettings("l2", ssim_weight=0)
 REMOVED = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 REFINED = (0.5, 0.9)
 TRUTH = "error"
+CHOICE = ("keep", "score", "refine")  # of what is pruned: what is kept of a curve does not depend on it
 STAGES = ("true removals", *SCORES, *(f"{name} refined" for name in SCORES))
 Row = dict[str, str | int | float]
 
@@ -69,8 +69,10 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         objective, l2 = (scene_objective(checkpoint, scene, loss=loss) for loss in (None, L2))
         held_out = scene.load(checkpoint.scene.test) if checkpoint.scene.test else []
-    digest = sha256(options.checkpoint.read_bytes()).hexdigest()
-    identity = f"{digest} {replace(options, out=None, keep=1, score='', refine=0)}"
+    amounts = {name: getattr(options, name) for name in ("curve", "curve_steps", "sample", *CHOICE)}
+    tested = {name: checkpoint.scene.views[name] for name in checkpoint.scene.test}
+    made = checkpoint.fingerprint(amounts, options.seed, further=tested)
+    identity = made.but(*(f"settings.{name}" for name in CHOICE)).digest
     with record_folder(out, RECORD) as folder, stages:
         kept = Kept(stages, torch.Generator().manual_seed(options.seed), STAGES, folder=unfinished, identity=identity)
         with stages.stage("scores"):
@@ -85,8 +87,8 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
             refine(training, objective.views, options.refine, options.seed)
             scene_from_there = replace(checkpoint.scene, relative=os.path.relpath(scene.root, out.resolve()))
             _write_pruned(folder, replace(checkpoint, training=training, scene=scene_from_there))
-        made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
-        (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
+        origin = provenance_of(made, options.checkpoint, command, checkpoint, scene)
+        (folder / RECORD).write_text(json_text(plain(origin)), encoding="utf-8")
         notes = draw_or_say("uses", folder) if curve is not None else []
         result = _scored(training.gaussians, objective, held_out)
     kept.remove()

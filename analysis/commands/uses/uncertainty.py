@@ -74,7 +74,9 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
                 report(place + 1, len(held_out), "held-out views")
         table = pd.DataFrame(rows)
         table.to_csv(folder / "agreement.csv", index=False)
-        made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
+        tested = {name: checkpoint.scene.views[name] for name in checkpoint.scene.test}
+        of = checkpoint.fingerprint({"samples": options.samples}, options.seed, L2, tested)
+        made = provenance_of(of, options.checkpoint, command, checkpoint, scene)
         (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     means = table.drop(columns="view").pivot_table(index="precision")  # by default means

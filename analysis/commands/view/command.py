@@ -23,6 +23,7 @@ from landscape.errors import InputError
 from splat.curvature.fields import FIELDS
 from splat.curvature.objective import SceneObjective
 from splat.training.checkpoint import write_atomically
+from splat.training.origin.fingerprint import Fingerprint
 
 STEEPEST = "e₁"
 
@@ -36,7 +37,8 @@ def run_view(options: ViewOptions) -> int:
     with stages.stage("load"):
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, folder / "view")
         objective = scene_objective(checkpoint, scene)
-        directions = steepest_directions(objective, folder / PROBE)
+        made = checkpoint.fingerprint({}, 0)
+        directions = steepest_directions(objective, folder / PROBE, made)
         start = heaviest_view(objective, directions[STEEPEST][0]) if STEEPEST in directions else 0
     server = _server(viser, options)
     try:
@@ -45,7 +47,7 @@ def run_view(options: ViewOptions) -> int:
             console.print(f"open http://{options.host}:{server.get_port()}; Ctrl-C ends it", highlight=False)
         notes: list[str] = []
         with stages, stages.stage("fields") as progress:
-            viewer.add_fields(measured_fields(objective, folder / PROBE, notes, progress), options.shown)
+            viewer.add_fields(measured_fields(objective, folder / PROBE, made, notes, progress), options.shown)
         say(*notes, style="yellow", console=console)
         if options.html is None:
             viewer.add_steps(directions)
@@ -85,9 +87,9 @@ def _link_from_report(run: Path, page: Path) -> None:
         report.write_report(run / PROBE)
 
 
-def steepest_directions(objective: SceneObjective, probe: Path) -> dict[str, tuple[Tensor, float]]:
+def steepest_directions(objective: SceneObjective, probe: Path, made: Fingerprint) -> dict[str, tuple[Tensor, float]]:
     """Unit vectors of the two largest eigenvalues in a probe, if any, and how far they may be followed."""
-    recorded = recorded_probe(probe, objective, [])
+    recorded = recorded_probe(probe, made, [])
     if recorded is None:
         return {}
     ends, vectors = recorded.data.eigenvalues, recorded.arrays["eigenvectors"]["largest"]

@@ -36,6 +36,7 @@ from msgspec import structs
 
 from analysis.console.overrides import overridden
 from analysis.measures.units import step_lengths
+from analysis.records.provenance import require_own
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS, Made, MapRecord, read_map, read_scores
 from analysis.runs.claims.effects import STRETCHED
@@ -87,9 +88,9 @@ def _trained(path: Path) -> list[Path]:
 
 
 def row_of(run: Path) -> dict[str, Any]:
-    """The row of one run.  A probe of another step than the checkpoint's is ignored."""
+    """The row of one run.  InputError where one of its records is of another checkpoint."""
     checkpoint = load_checkpoint(run / CHECKPOINT)
-    config, step = checkpoint.training.config, checkpoint.training.step
+    config, step, state = checkpoint.training.config, checkpoint.training.step, checkpoint.state
     row = {
         "scene": Path(checkpoint.scene.absolute).name,
         "method": method_name(config, checkpoint.scene.start),
@@ -98,24 +99,26 @@ def row_of(run: Path) -> dict[str, Any]:
         "views": len(checkpoint.scene.train),
         "size": ", ".join(sorted({f"{width} x {height}" for width, height in checkpoint.scene.sizes})),
     }
-    row |= metrics_of(run) | _made(run) | _of_map(run)
+    made = read_scores(run).provenance or Made()
+    require_own(
+        made.fingerprint, state, run / METRICS, "repeat the training's command with --resume, which scores again"
+    )
+    row |= metrics_of(run) | {"date": made.created[:10], "machine": made.machine.cpu if made.machine else ""}
+    row |= {"commit": made.commit or ""} | _of_map(run, state)
     if not (run / PROBE / ProbeRecord.FILE).is_file():
         return row
     data = read_record(run / PROBE, ProbeRecord).data
-    if data.provenance.iteration != step:
-        return row
+    require_own(data.provenance.fingerprint, state, run / PROBE / ProbeRecord.FILE, "probe again")
     return row | probe_of(run) | _more(data, config.rates, checkpoint.training.extent)
 
 
-def _made(run: Path) -> dict[str, str]:
-    made = read_scores(run).provenance or Made()
-    return {"date": made.created[:10], "machine": made.machine.cpu if made.machine else "", "commit": made.commit or ""}
-
-
-def _of_map(run: Path) -> dict[str, float]:
-    if not (run / MapRecord.COMMAND / MapRecord.FILE).is_file():
+def _of_map(run: Path, state: str) -> dict[str, float]:
+    path = run / MapRecord.COMMAND / MapRecord.FILE
+    if not path.is_file():
         return {}
-    found = read_map(run / MapRecord.COMMAND).fragility
+    data = read_map(path.parent)
+    require_own(data.provenance.fingerprint, state, path, "map again")
+    found = data.fragility
     row = {f"needles_{name}": found.needles_trace.get(name, nan) for name in STRETCHED}
     row |= {"needle_count": found.needles, "depth_gradient": _number(found.depth_gradient)}
     return row | {"opacity_one_view": _number(found.opacity_one_view)}

@@ -27,19 +27,19 @@ from rich.console import Console
 from analysis.console.drawing import own_python
 from analysis.console.interruption import interruption
 from analysis.console.plain import say
+from analysis.probe.command import asked
 from analysis.probe.options import ProbeOptions
-from analysis.probe.record import loss_name
 from analysis.records.provenance import usable_cores
 from analysis.records.records import ProbeRecord, read_record
-from analysis.records.run_files import CHECKPOINT, METRICS
+from analysis.records.run_files import CHECKPOINT, METRICS, read_scores
 from analysis.runs.options import SweepOptions
 from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import PROBE, of_other_threads, summarize, tables, unfinished, write_results
 from analysis.train.command import planned, resumed
 from landscape.errors import InputError
-from splat.losses.reference import LossSettings
 from splat.model.untrusted import Taken, locked
+from splat.training.checkpoint import Checkpoint
 
 CELL_FAILED = 1
 CELLS_ELSEWHERE = 75  # sysexits.h's EX_TEMPFAIL: the same command later finds them done
@@ -74,27 +74,32 @@ def only(sweep: Sweep, names: Sequence[str]) -> Sweep:
 def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
     """Stages that a cell still needs.  ValueError or FileNotFoundError where it cannot be, or has other settings."""
     try:
-        _, _, config, reference = planned(cell.training, cell.out)
+        scene, _, config, reference = planned(cell.training, cell.out)
         wanted: list[Stage] = ["train", "probe"] if sweep.probe else ["train"]
         if not cell.out.exists():
             return wanted
         remedy = f"remove {cell.out}, or choose another out"
-        training = resumed(cell.out / CHECKPOINT, config, reference, remedy)
+        checkpoint = resumed(cell.out / CHECKPOINT, config, reference, remedy)
     except (InputError, FileNotFoundError) as error:
         raise type(error)(f"{sweep.file}, {cell.name}: {error}") from None
-    if training.step < config.iterations or not (cell.out / METRICS).is_file():
+    if checkpoint.training.step < config.iterations or not _scored(cell, checkpoint):
         return wanted
-    return ["probe"] if sweep.probe and not _probed(cell, sweep.probe, config.loss) else []
+    thinned = checkpoint.thinned(scene, sweep.probe.foreign.max_views) if sweep.probe else checkpoint
+    return ["probe"] if sweep.probe and not _probed(cell, sweep.probe, thinned) else []
 
 
-def _probed(cell: Cell, options: ProbeOptions, loss: LossSettings) -> bool:
-    """Whether there is a record of the last step, with the loss and the control that the options ask for."""
+def _scored(cell: Cell, checkpoint: Checkpoint) -> bool:
+    """Whether there are scores of the checkpoint."""
+    made = read_scores(cell.out).provenance if (cell.out / METRICS).is_file() else None
+    return bool(made and made.fingerprint and made.fingerprint.state == checkpoint.state)
+
+
+def _probed(cell: Cell, options: ProbeOptions, checkpoint: Checkpoint) -> bool:
+    """Whether there is a record of the checkpoint with the numbers that the options ask for."""
     if not (cell.out / PROBE / ProbeRecord.FILE).is_file():
         return False
-    data = read_record(cell.out / PROBE, ProbeRecord).data
-    asked = loss_name(LossSettings() if options.loss == "3dgs" else loss)
-    whole = bool(data.split_control) or not options.split_control
-    return data.provenance.iteration == cell.steps and whole and (data.objective.loss or asked) == asked
+    found = read_record(cell.out / PROBE, ProbeRecord).data.provenance.fingerprint
+    return bool(found and found.answers(asked(options, checkpoint)))
 
 
 class _Cells:

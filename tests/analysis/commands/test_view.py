@@ -15,8 +15,10 @@ from analysis.measures.steepest import heaviest_view
 from splat.curvature.objective import SceneObjective
 from splat.projection.reference import rotation_matrices
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.training.origin.fingerprint import Fingerprint
 from tests.splat.render.test_sight import weights
 
+NOTHING = Fingerprint({}, {}, "")
 MADE = synthetic_scene(SyntheticSettings(gaussians=150, views=2, width=32, height=24))
 
 
@@ -70,7 +72,7 @@ def test_a_click_finds_the_splat_with_most_weight(objective):
 
 
 def test_the_controls_colour_hide_and_step(viewer, objective):
-    fields = measured_fields(objective, Path("nowhere"), [], lambda *_: None)
+    fields = measured_fields(objective, Path("nowhere"), NOTHING, [], lambda *_: None)
     viewer.add_fields(fields, "largest")
     values = fields.values["largest"].numpy()
     expected = fields.shade("largest").colours_of(values)
@@ -131,7 +133,7 @@ def test_the_view_of_a_direction_is_that_where_its_heaviest_gaussian_weighs_most
 
 
 def test_a_pick_is_outlined_and_lists_the_field_shown_first(viewer, objective):
-    viewer.add_fields(measured_fields(objective, Path("nowhere"), [], lambda *_: None), "largest")
+    viewer.add_fields(measured_fields(objective, Path("nowhere"), NOTHING, [], lambda *_: None), "largest")
     viewer.click(*_ray(viewer, objective))
     index, _ = viewer.picked
     told = viewer.numbers.content.splitlines()
@@ -156,7 +158,7 @@ def _ray(viewer: view.Viewer, objective: SceneObjective) -> tuple[list[float], l
 
 
 def test_a_page_needs_no_network(viewer):
-    viewer.add_fields(measured_fields(viewer.objective, Path("nowhere"), [], lambda *_: None), "condition")
+    viewer.add_fields(measured_fields(viewer.objective, Path("nowhere"), NOTHING, [], lambda *_: None), "condition")
     written = page.offline_page(viewer, "condition")
     assert "__VISER_EMBED_DATA__" in written and len(written) < 2e6
     assert 'src="http' not in written and 'href="http' not in written

@@ -14,13 +14,17 @@ from rich.console import Console
 from analysis.probe.summary import summary
 from analysis.records import report
 from analysis.records.findings import findings
+from analysis.records.json_files import plain
 from analysis.records.quantities import exponent_of
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
 from analysis.records.report import interactive_surface, numbers, write_report
 from analysis.records.tables import family_table, probe_table
 from landscape.slices.eye import eye_over
+from splat.training.origin.fingerprint import Fingerprint, ViewData
 from tests.recorded import depth_section, probe_of, soft, synthetic, written
 
+LEVEL = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+LENS, SIZE = (9.0, 9.0, 4.0, 3.0), (8, 6)
 UNPACKS = 'new DecompressionStream("gzip")'  # plotly.js
 
 
@@ -102,11 +106,15 @@ def with_views(folder, names, data=None):
     return folder / "report.html"
 
 
-@pytest.mark.parametrize("step", [None, 10], ids=["of this step", "of another step"])
-def test_the_map_beside_the_record_says_where(tmp_path, step):
+@pytest.mark.parametrize(
+    "other", [{}, {"state": "11"}, {"data": {}}, {"question": {"objective.loss.ssim_weight": 0.0}}], ids=str
+)
+def test_the_map_beside_the_record_says_where_if_it_is_of_the_same(tmp_path, other):
     data, _ = synthetic()
-    data["provenance"]["iteration"] = 10
-    made = data["provenance"] | {"iteration": 10 if step is None else 20}
+    seen = {"a.png": ViewData(LEVEL, (0.0, 0.0, 1.0), LENS, SIZE)}
+    of = plain(Fingerprint(seen, {"objective.loss.ssim_weight": 0.2, "settings.field": "largest"}, "00"))
+    data["provenance"]["fingerprint"] = of | {"question": {"objective.loss.ssim_weight": 0.2, "seed": 3}}
+    made = data["provenance"] | {"fingerprint": of | other}
     shade = {"name": "largest", "words": "largest <curvature>", "unit": "1", "scale": "log", "low": 0.0, "high": 1.0}
     swaps = {"lengths": [1.0], "share": [[0.5]], "pairs": [4], "jump": None, "jump_error": None, "sampled": 0}
     axes = {"condition": {"50": 2.0}, "needles": 0.1, "needles_steepest": {}, "needles_trace": {}, "one_view": 0.2}
@@ -141,7 +149,7 @@ def test_the_map_beside_the_record_says_where(tmp_path, step):
     for name in ("steepest-e1.png", "fragility-000.png"):
         Image.new("RGB", (8, 6)).save(tmp_path / "map" / name)
     text = with_views(tmp_path / "probe", ["a.png"], data).read_text(encoding="utf-8")
-    here = step is None
+    here = not other
     assert text.count("data:image/") == (4 + 2 if here else 2)
     assert ("Largest &lt;curvature&gt;, 1" in text) == here and "<curvature>" not in text
     said = Page(text).text
@@ -276,7 +284,7 @@ def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
 def test_text_of_the_record_cannot_become_markup(tmp_path):
     evil = '</script><script>alert(1)</script><img src="http://example.org/x.png">'
     data, arrays = synthetic()
-    data["provenance"] |= {"scene": evil, "settings": {evil: [evil]}}
+    data["provenance"] |= {"scene": evil, "fingerprint": plain(Fingerprint({}, {evil: [evil]}, evil))}
     data["notes"] = [evil]
     data["slice"]["directions"][0]["name"] = evil
     data["checks"]["symmetry"]["note"] = evil
@@ -446,7 +454,9 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     data, arrays = synthetic()
     data["anisotropy"][index] = {"value": -361.25, "low": 0.5, "high": None, "note": "open"}
     data["eigenvalues"]["min"] |= {"reason": reason, "matvecs": 15}
-    data["provenance"] |= {"settings": settings, "command": "landscape probe run --seconds 45 --out there"}
+    asked = {f"settings.{name}": value for name, value in settings.items()}
+    data["provenance"] |= {"fingerprint": plain(Fingerprint({}, asked, "00"))}
+    data["provenance"] |= {"command": "landscape probe run --seconds 45 --out there"}
     (line,) = (line for line in findings(probe_of(data)) if line.level == "open")
     assert line.text.startswith(f"{index.replace('_', ' ').capitalize()}: – (at least 0.500); ")
     assert line.text.endswith(f"{command}." if command else "no more products resolve it.")

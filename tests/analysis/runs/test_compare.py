@@ -10,21 +10,25 @@ import pytest
 from PIL import Image
 
 from analysis.commands.cli import main
-from analysis.probe.command import opened
+from analysis.probe.command import asked, opened
 from analysis.probe.record import provenance_of
 from analysis.records.json_files import plain
 from analysis.records.quantities import measured, quantity
 from analysis.records.schema import Index
 from analysis.records.tables import bracketed
 from analysis.runs import compared
+from analysis.runs.claims.study import row_of
+from figures.compare import draw_comparison
+from landscape.errors import InputError
 from splat.losses.reference import LossSettings
 from splat.model.files.splat_ply import splat_ply
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.methods.sam import SAM
+from splat.training.origin.fingerprint import FORMULAS
 from tests.figures.test_trajectory_figure import rows
-from tests.recorded import depth_section, synthetic, written
+from tests.recorded import depth_section, own, synthetic, written
 
 ITERATIONS = 4
 SETTINGS = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
@@ -34,7 +38,7 @@ FACTOR = {"value": 2.5, "low": 2.0, "high": 3.1, "note": ""}
 def record(folder: Path, scale: float, **changes) -> None:
     """A record in place of a probe, with the split control."""
     data, arrays = synthetic(scale)
-    data["provenance"] |= {"iteration": ITERATIONS} | changes
+    data["provenance"] |= {"iteration": ITERATIONS} | own(folder.parent) | changes
     effects = [{"operator": "hessian", "block": block, "index": "saddle", **FACTOR} for block in ("all", "means")]
     data["split_control"] = {
         "gaussians": 20182,
@@ -157,6 +161,7 @@ def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(train
 
 def test_runs_with_the_same_parameters_are_said_to_be_the_same(runs, capsys, no_pictures):
     shutil.copy(Path(runs[0]) / "checkpoint.pt", Path(runs[1]) / "checkpoint.pt")
+    record(Path(runs[1]) / "probe", 0.5)
     assert main(["compare", *runs]) == 0
     assert capsys.readouterr().out.startswith("sam/0: parameters are identical to plain/0.")
     changed(runs[1], method=SAM())
@@ -207,7 +212,8 @@ def test_other_functions_are_not_compared(runs, capsys):
     refused(capsys, runs, "expected runs with the same background")
     path = Path(runs[0]) / "checkpoint.pt"
     loaded = load_checkpoint(path)
-    save_checkpoint(path, loaded.training, replace(loaded.scene, sizes=[[8, 6]] * 3))
+    small = {name: replace(view, size=(8, 6)) for name, view in loaded.scene.views.items()}
+    save_checkpoint(path, loaded.training, replace(loaded.scene, views=small))
     refused(capsys, runs, "expected runs with the same sizes of the views")
     save_checkpoint(path, loaded.training, replace(loaded.scene, train=loaded.scene.train[::-1]))
     refused(capsys, runs, "expected runs with the same training views")
@@ -254,7 +260,8 @@ def test_trajectories_of_other_functions_are_not_drawn_into_one_picture(runs, ca
 def test_a_run_without_a_record_is_refused_with_the_command_or_probed(runs, capsys, monkeypatch, no_pictures):
     for run in runs:
         shutil.rmtree(Path(run) / "probe")
-    record(Path(runs[1]) / "probe", 1.0, iteration=ITERATIONS - 1)  # of an earlier step
+    earlier = own(Path(runs[1]))["fingerprint"] | {"state": "of an earlier step"}
+    record(Path(runs[1]) / "probe", 1.0, fingerprint=earlier)
     commands = [f"landscape probe {run}/checkpoint.pt" for run in runs]
     refused(capsys, runs, "expected probed runs", "; ".join(commands), "--probe")
     asked = []
@@ -273,11 +280,9 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
     assert main(["compare", *runs]) == 0
     assert "not the same" not in capsys.readouterr().out
     data, arrays = synthetic()
-    data["provenance"] |= {
-        "iteration": ITERATIONS,
-        "dtype": "float64",
-        "settings": {"eigen": {"rtol": 0.5}, "quick": True},
-    }
+    data["provenance"] |= {"iteration": ITERATIONS, "dtype": "float64"} | own(Path(runs[1]))
+    data["provenance"]["fingerprint"]["question"] |= {"settings.eigen.rtol": 0.5, "settings.quick": True}
+    data["provenance"]["fingerprint"]["formulas"] = FORMULAS + 1
     data["checks"]["symmetry"]["passed"] = False
     written(Path(runs[1]) / "probe", data, arrays)
     (Path(runs[1]) / "metrics.json").unlink()
@@ -287,7 +292,8 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
     for part in (
         "The seed is not the same",
         "The precision is not the same",
-        "The probes were run with different settings (those of plain/0, sam/0): eigen.rtol None, 0.5; quick None, True.",
+        "The probes were run with different settings (those of plain/0, sam/0): eigen.rtol 0.001, 0.5; quick None, True.",
+        f"The probes are of versions {FORMULAS}, {FORMULAS + 1} of the formulas: probe again.",
         "sam/0: The check of symmetry failed",
         "sam/0: It was not scored.",
         "plain/0: The search for the smallest eigenvalue ended at its time budget: the end may lie farther out. "
@@ -301,11 +307,11 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
 
 def test_what_holds_of_many_runs_is_said_once_and_seeds_may_differ(runs, capsys, no_pictures):
     data, arrays = synthetic()
-    data["provenance"] |= {"iteration": ITERATIONS}
     data["checks"]["symmetry"]["passed"] = False
     data["anisotropy"]["share"] |= {"value": None, "low": None, "high": None}
     for run, seed in zip(runs, (0, 3), strict=True):
         changed(run, seed=seed)
+        data["provenance"] |= {"iteration": ITERATIONS} | own(Path(run))
         written(Path(run) / "probe", data, arrays)
     assert main(["compare", *runs]) == 0
     said = " ".join(capsys.readouterr().out.split())
@@ -323,7 +329,7 @@ def trained_again(runs: list[str]) -> Path:
 def test_families_that_only_one_run_has_are_in_no_other_units(runs, capsys, no_pictures):
     words, folder = "The units of the families are not the same.", Path(runs[1]) / "probe"
     data, arrays = synthetic()
-    data["provenance"] |= {"iteration": ITERATIONS}
+    data["provenance"] |= {"iteration": ITERATIONS} | own(Path(runs[1]))
     for changes, said in (({"families": []}, False), ({"families": [other_units(runs[0])]}, True)):
         written(folder, data | changes, arrays)
         assert main(["compare", *runs]) == 0
@@ -346,19 +352,19 @@ def test_files_of_other_tools_are_compared_as_they_were_probed(trained, tmp_path
         for file in files
     ]
     refused(capsys, words, "expected probed runs", "; ".join(commands), "--probe")
-    asked = []
+    commanded = []
 
     def probe(options, command) -> int:
-        asked.append(" ".join(command))
+        commanded.append(" ".join(command))
         checkpoint, loaded = opened(options.checkpoint, options.scene, options.foreign, options.out)
         data, arrays = synthetic()
-        made = provenance_of(0, options.checkpoint, command, options, checkpoint, loaded)
+        made = provenance_of(asked(options, checkpoint), options.checkpoint, command, checkpoint, loaded)
         data["provenance"] = plain(made)
         written(options.out, data, arrays)
         return 0
 
     monkeypatch.setattr("analysis.runs.compared.run_probe", probe)
-    assert main(["compare", *words, "--probe"]) == 0 and asked == commands
+    assert main(["compare", *words, "--probe"]) == 0 and commanded == commands
     assert main(["compare", *words]) == 0  # both are there
     files[0].with_name("probe-a").rename(tmp_path / "probe")  # as of landscape probe without --out
     found = []
@@ -370,6 +376,90 @@ def test_files_of_other_tools_are_compared_as_they_were_probed(trained, tmp_path
     capsys.readouterr()
     refused(capsys, [*words, "--trained-by", "gsplat-raw"], "no record of the checkpoint in", "--trained-by gsplat-raw")
     assert "was not scored" in (tmp_path / "compare/compare.html").read_text()
+
+
+def replaced(run: str) -> None:
+    """The run's checkpoint, by another of the same step."""
+    loaded = load_checkpoint(Path(run) / "checkpoint.pt")
+    loaded.training.gaussians = loaded.training.gaussians.with_flat(loaded.training.gaussians.flat + 0.01)
+    save_checkpoint(Path(run) / "checkpoint.pt", loaded.training, loaded.scene)
+
+
+def test_records_of_a_checkpoint_that_was_replaced_are_refused_or_measured_anew(runs, capsys, monkeypatch, no_pictures):
+    replaced(runs[0])
+    refused(
+        capsys, runs, f"no record of the checkpoint in {runs[0]}, where {runs[0]}/probe is of another; run landscape"
+    )
+
+    def probe(options, command) -> int:
+        record(options.checkpoint.parent / "probe", 1.0)
+        return 0
+
+    monkeypatch.setattr("analysis.runs.compared.run_probe", probe)
+    assert main(["compare", *runs, "--probe"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"{runs[0]}/probe was of another checkpoint or renderer, and has been measured anew" in said
+    assert (
+        f"scores are left out: expected in {runs[0]}/metrics.json a record of the checkpoint beside it, got one" in said
+    )
+    assert "plain/0: It was not scored." in said and main(["compare", *runs]) == 0
+
+
+def test_another_file_of_the_same_name_and_step_is_not_the_one_that_was_probed(trained, tmp_path, capsys):
+    truth = synthetic_scene(SETTINGS).truth
+    files, scene = [tmp_path / "a/point_cloud.ply", tmp_path / "b/point_cloud.ply"], str(trained.parent / "still")
+    for file, gaussians in zip(files, (truth, truth.with_flat(1.01 * truth.flat)), strict=True):
+        file.parent.mkdir()
+        file.write_bytes(splat_ply(gaussians, tool="splat-landscape"))
+        words = [
+            "--scene",
+            scene,
+            "--views",
+            "3",
+            "--quick",
+            "--slice-points",
+            "5",
+            "--out",
+            str(file.parent / "probe"),
+        ]
+        assert main(["probe", str(file), *words]) == 0
+    shutil.copy(files[1], files[0])
+    capsys.readouterr()
+    refused(capsys, [*map(str, files), "--scene", scene, "--views", "3"], f"where {tmp_path}/a/probe is of another")
+
+
+def test_views_that_were_changed_between_two_probes_are_said(runs, capsys, no_pictures):
+    data, arrays = synthetic()
+    data["provenance"] |= {"iteration": ITERATIONS} | own(Path(runs[1]))
+    name, view = next(iter(data["provenance"]["fingerprint"]["data"].items()))
+    view["lens"] = [1.03 * length for length in view["lens"]]
+    written(Path(runs[1]) / "probe", data, arrays)
+    assert main(["compare", *runs]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    for whose in ("its training", "plain/0"):
+        assert f"The views of sam/0's probe are not those of {whose}: '{name}': focal length by +3%" in said
+
+
+@pytest.mark.parametrize("what", ["metrics.json", "probe/probe.json"])
+def test_a_study_refuses_records_of_another_checkpoint(runs, what):
+    assert row_of(Path(runs[0]))["steps"] == ITERATIONS
+    path = Path(runs[0]) / what
+    text = path.read_text()
+    state = load_checkpoint(Path(runs[0]) / "checkpoint.pt").state
+    assert state in text
+    path.write_text(text.replace(state, "of another"))
+    with pytest.raises(
+        InputError, match=f"expected in {path} a record of the checkpoint beside it, got one of another"
+    ):
+        row_of(Path(runs[0]))
+
+
+def test_figures_of_a_comparison_are_of_the_records_that_were_compared(runs, tmp_path, no_pictures):
+    assert main(["compare", *runs, "--out", str(tmp_path)]) == 0
+    replaced(runs[1])
+    record(Path(runs[1]) / "probe", 1.0)
+    with pytest.raises(InputError, match=r"expected the record that was compared in .*, got another; compare again"):
+        draw_comparison(tmp_path)
 
 
 def test_at_least_two_different_runs_are_asked_for(runs, capsys):

@@ -16,7 +16,7 @@ from msgspec import convert
 
 from analysis.commands.cli import main
 from analysis.probe.command import scene_objective
-from analysis.probe.record import loss_name
+from analysis.records.json_files import plain
 from analysis.records.records import Record, read_record
 from analysis.records.schema import FiniteProbe
 from analysis.slice.command import _finite_curvature
@@ -24,12 +24,12 @@ from figures.make_all import recorded_figures
 from figures.plane import plane
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
-from splat.losses.reference import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.adam import Adam
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import ScreenGradients
+from splat.training.origin.fingerprint import Fingerprint
 from tests.recorded import soft, synthetic, synthetic_line, written
 
 ROOT = Path(__file__).parents[3]
@@ -135,10 +135,10 @@ def test_the_default_is_the_plane_of_the_two_largest_eigenvalues(eigen, objectiv
     assert eigen.data.counts.renders == 3 * (81 + 1) and eigen.data.finite_probe is None
 
 
-def probed(folder: Path, value: float, vectors: np.ndarray, loss: LossSettings) -> None:
-    """The record of a probe with these eigenvectors, beside a checkpoint whose loss has this value."""
+def probed(folder: Path, made: Fingerprint, vectors: np.ndarray) -> None:
+    """The record of a probe with these eigenvectors."""
     data, _ = synthetic()
-    data["objective"] |= {"loss": loss_name(loss), "operator": "hessian", "value": value}
+    data["provenance"] |= {"fingerprint": plain(made)}
     written(folder / "probe", data, {"eigenvectors": {"largest": vectors}})
 
 
@@ -146,19 +146,19 @@ def test_the_probes_eigenvectors_are_taken_where_they_are_the_checkpoints(run, e
     path, scene = tmp_path / "run" / "double.pt", ["--scene", str(run.parent / "still")]
     path.parent.mkdir()
     shutil.copy(run / "double.pt", path)
-    loss = load_checkpoint(path).training.config.loss
-    vectors, value = eigen.arrays["directions"]["vectors"], eigen.data.slice.center_loss
-    probed(path.parent, value, -vectors, loss)  # told apart from those that Lanczos finds
+    vectors, made = eigen.arrays["directions"]["vectors"], eigen.data.provenance.fingerprint
+    probed(path.parent, made, -vectors)  # told apart from those that Lanczos finds
     taken = sliced(tmp_path / "taken", path, *scene, *POINTS)
     assert np.array_equal(taken.arrays["directions"]["vectors"], -vectors)
     assert taken.data.counts.products == 6  # of two vectors: to confirm them, for their curvatures, for the model
     turned = vectors @ np.array([[0.8, -0.6], [0.6, 0.8]])
     swapped = np.ascontiguousarray(vectors[:, ::-1])  # true eigenvectors, but the first is not the steepest
-    cases = [(vectors, 1.001 * value), (turned, value), (vectors[:-1], value), (swapped, value)]
-    for number, (recorded, of) in enumerate(cases):
-        probed(path.parent, of, recorded, loss)
+    other, notes = replace(made, state="another"), [f"eigenvectors were not taken from {path.parent / 'probe'}: "]
+    notes[0] += "it is a probe of another checkpoint; probe again"
+    for number, recorded in enumerate((vectors, turned, vectors[:-1], swapped)):
+        probed(path.parent, made if number else other, recorded)
         computed = sliced(tmp_path / str(number), path, *scene, *POINTS)
-        assert computed.data.notes == []
+        assert computed.data.notes == ([] if number else notes)
         assert computed.data.counts.products > 6
         for found, exact in zip(computed.data.slice.directions, eigen.data.slice.directions, strict=True):
             assert abs(found.curvature - exact.curvature) <= found.residual + exact.residual
@@ -169,8 +169,9 @@ def test_a_probe_and_eigenvectors_that_cannot_be_read_are_named(run, tmp_path, c
     (path.parent / "probe").mkdir(parents=True)
     shutil.copy(run / "double.pt", path)
     (path.parent / "probe" / "probe.json").write_text("{")
-    unfinished = out.with_name(f".{out.name}.unfinished")
-    unfinished.mkdir()
+    kept = load_checkpoint(path).fingerprint({}, 0).but("settings", "seed").digest
+    unfinished = out.with_name(f".{out.name}.unfinished") / kept
+    unfinished.mkdir(parents=True)
     (unfinished / "eigenvectors.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', ")
     record = sliced(out, path, "--scene", str(run.parent / "still"), "--dimension", "1", *POINTS)
     said = " ".join(capsys.readouterr().out.split())

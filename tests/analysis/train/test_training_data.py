@@ -27,6 +27,7 @@ from analysis.train.remarks import (
     poor_start,
     removes_for_size,
 )
+from landscape.errors import InputError
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -259,13 +260,24 @@ def test_photographs_that_were_replaced_are_noticed_by_probe_and_resume(original
     probe = ["probe", str(out / "checkpoint.pt"), "--quick"]
     assert train(scene, out, "--resume") == main(probe) == 2
     said = capsys.readouterr().err
-    assert said.count(f"got another file for '{name}' (1 of 3 training views have one)") == 2
-    content = torch.load(out / "checkpoint.pt", weights_only=True)
-    del content["scene"]["photographs"]  # as older files, which do not know them
-    torch.save(content, out / "checkpoint.pt")
-    assert train(scene, out, "--resume") == main(probe) == 0
-    seen = read_record(out / "probe-quick").data.provenance.photographs
-    assert isinstance(seen, list) and len(set(seen)) == 3
+    assert said.count(f"got changes in 1 of 4: '{name}': another photograph; restore them") == 2
+    assert main([*probe, "--accept-changed"]) == 0
+    made = read_record(out / "probe-quick").data.provenance.fingerprint
+    assert made and len({view.photograph for view in made.data.values()}) == 3
+
+
+def test_a_run_with_masks_of_a_folder_is_probed_and_resumed_with_these(original, tmp_path, capsys):
+    (tmp_path / "masks").mkdir()
+    for path in images(original):
+        Image.fromarray(np.full((18, 24), 255, np.uint8)).save(tmp_path / "masks" / path.name)
+    out, masks = tmp_path / "run", ["--masks", str(tmp_path / "masks")]
+    assert train(original, out, *masks) == train(original, out, *masks, "--resume") == 0
+    assert train(original, out, "--resume") == 2 and "masks = " in capsys.readouterr().err
+    loaded = load_checkpoint(out / "checkpoint.pt")
+    assert loaded.load_scene(out / "checkpoint.pt").load(loaded.scene.test)[0].mask is not None
+    (tmp_path / "masks" / Path(loaded.scene.test[0]).name).unlink()
+    with pytest.raises(InputError, match="no mask where there was one"):
+        loaded.load_scene(out / "checkpoint.pt")
 
 
 def test_a_method_in_place_of_adam_says_what_it_leaves_out():

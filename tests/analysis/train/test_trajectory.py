@@ -52,13 +52,13 @@ def run(scene) -> Path:
 
 @pytest.fixture(scope="module")
 def at_the_end(run) -> tuple:
-    """(training, views, objective) of the finished run."""
+    """(training, views, objective, reference) of the finished run."""
     path = run / "checkpoint.pt"
     loaded = load_checkpoint(path)
     views = loaded.load_scene(path).load(loaded.scene.train)
     config = loaded.training.config
     objective = SceneObjective(loaded.training.gaussians, views, config.loss, torch.zeros(3), config.render)
-    return loaded.training, views, objective
+    return loaded.training, views, objective, loaded.scene
 
 
 def test_probing_changes_no_bit_of_the_training(scene, run):
@@ -77,17 +77,21 @@ def test_a_row_is_written_every_so_many_steps_with_every_column(run):
 
 
 def test_the_last_row_is_that_of_the_checkpoint(run, at_the_end, tmp_path):
-    training, views, _ = at_the_end
-    trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY, float("inf")))
+    training, views, _, reference = at_the_end
+    trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY, float("inf")), reference)
     trajectory.after_step(1.0)
     written, (again,) = rows(run).iloc[-1], trajectory.rows
     assert {key: again[key] for key in again if key not in (*TIMES, "note")} == {
         key: written[key] for key in again if key not in (*TIMES, "note")
     }
+    assert trajectory.mixed == ""
+    for part in ("of_data", "of_question", "of_formulas"):
+        trajectory.rows = [again | {part: "another", "step": 3}, again]
+        assert trajectory.mixed.startswith("records of step 3 are of other views, settings or formulas than today's")
 
 
 def test_the_search_for_the_ends_begins_at_the_directions_of_single_gaussians(at_the_end, monkeypatch):
-    _, _, objective = at_the_end
+    _, _, objective, _ = at_the_end
     starts = []
 
     def noted(operator, generator, settings, start):
@@ -100,9 +104,9 @@ def test_the_search_for_the_ends_begins_at_the_directions_of_single_gaussians(at
 
 
 def test_a_row_is_the_landscape_within_its_errors(at_the_end, tmp_path):
-    training, views, objective = at_the_end
+    training, views, objective, reference = at_the_end
     few = replace(training, gaussians=training.gaussians.select(objective.mask.nonzero()[:15, 0]))
-    trajectory = Trajectory(tmp_path, few, views, TrajectorySettings(EVERY, float("inf")))
+    trajectory = Trajectory(tmp_path, few, views, TrajectorySettings(EVERY, float("inf")), reference)
     trajectory.after_step(1.0)
     (row,) = trajectory.rows
     config = training.config
@@ -151,7 +155,7 @@ def test_a_run_killed_beside_a_checkpoint_and_resumed_gives_the_same_rows(scene,
 
 
 def test_exact_traces_are_those_that_samples_estimate(at_the_end):
-    _, _, objective = at_the_end
+    _, _, objective, _ = at_the_end
     exact, sampled = (
         measure(objective, torch.Generator().manual_seed(0), TrajectorySettings(EVERY), level).traces
         for level in ("whole", "coarse")
@@ -165,9 +169,9 @@ def test_exact_traces_are_those_that_samples_estimate(at_the_end):
 @pytest.fixture
 def along(at_the_end, tmp_path) -> Trajectory:
     """The records of a long training with a tenth of its time, at a pace of a second."""
-    training, views, _ = at_the_end
+    training, views, _, reference = at_the_end
     longer = replace(training, config=replace(training.config, iterations=10 * STEPS))
-    trajectory = Trajectory(tmp_path, longer, views, TrajectorySettings(EVERY, 0.1))
+    trajectory = Trajectory(tmp_path, longer, views, TrajectorySettings(EVERY, 0.1), reference)
     trajectory.taken = {"coarse": (10.0, len(training.gaussians))}
     return trajectory
 

@@ -16,9 +16,8 @@ import torch
 from landscape.errors import InputError
 from splat.model.files.tensor_files import load_tensors
 from splat.model.settings import RenderSettings
-from splat.training.checkpoint import LATER, load_checkpoint, save_checkpoint, write_atomically
+from splat.training.checkpoint import LATER, VERSION, load_checkpoint, save_checkpoint, write_atomically
 from splat.training.loop import train
-from splat.training.methods.methods import ThreeDGS
 from splat.training.state import Training
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
@@ -391,17 +390,16 @@ def test_the_scene_is_found_from_the_checkpoint_else_where_it_was(tmp_path):
         reference.find(run / "checkpoint.pt")
 
 
-def test_a_checkpoint_from_before_there_were_methods_is_3dgs(path):
+@pytest.mark.parametrize("version", [1, VERSION - 1, VERSION + 1])
+def test_a_checkpoint_of_another_version_is_refused_in_one_sentence(path, version):
     content = torch.load(path, weights_only=True)
-    content["version"] = 1
-    del content["regularizer"], content["config"]["method"]
+    del content["scene"]["views"]  # as in older files
+    torch.save(content | {"version": version}, path)
+    refused(path, f"its format version is {version}, this program reads {VERSION}; take another copy .*, or train anew")
+
+
+def test_a_checkpoint_says_what_was_seen_of_every_view(path):
+    content = torch.load(path, weights_only=True)
+    del content["scene"]["views"]["view1"]
     torch.save(content, path)
-    assert load_checkpoint(path).training.config.method == ThreeDGS()
-
-
-def test_checkpoints_from_before_the_start_was_recorded_are_read(tmp_path):
-    save_checkpoint(tmp_path / "new.pt", Training.start(tiny_gaussians(), EXTENT, tiny_config()), REFERENCE)
-    content = torch.load(tmp_path / "new.pt", weights_only=True)
-    del content["scene"]["start"], content["scene"]["depths"]
-    torch.save(content, tmp_path / "old.pt")
-    assert load_checkpoint(tmp_path / "old.pt").scene == REFERENCE
+    refused(path, "it does not say what was seen of 1 of its views, such as 'view1'")

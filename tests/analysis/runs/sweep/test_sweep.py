@@ -19,7 +19,6 @@ import torch
 import tyro
 
 from analysis.commands.cli import main
-from analysis.probe.record import loss_name
 from analysis.records.provenance import usable_cores
 from analysis.runs.sweep.sweep import CELLS_ELSEWHERE, _Cells, lock_of, missing, only, probe_arguments
 from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
@@ -27,12 +26,12 @@ from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import results
 from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
-from splat.losses.reference import LossSettings
 from splat.model.untrusted import locked
 from splat.render.forward import background_of
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
+from splat.training.origin.fingerprint import FORMULAS
 from tests import recorded
 from tests.recorded import synthetic
 
@@ -321,8 +320,7 @@ def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, fold
     cell = with_probe.cells[0]
     assert missing(cell, finished) == [] and missing(cell, with_probe) == missing(cell, control) == ["probe"]
     data, arrays = synthetic()
-    data["provenance"]["iteration"] = 12
-    data["objective"]["loss"] = loss_name(LossSettings())
+    data["provenance"] |= recorded.own(cell.out)
     recorded.written(cell.out / "probe", data, arrays)
     try:
         assert missing(cell, with_probe) == [] and missing(cell, control) == ["probe"]
@@ -330,11 +328,28 @@ def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, fold
         row = results([cell], {cell.name: "done"}).iloc[0]
         assert row["trace_means"] == data["traces"]["means"]["value"] and row["lambda_min_error"] == 3.0
         assert (row["saddle_low"], row["saddle_high"]) == (139.0, 143.0) and row["share"] is None
-        data["objective"]["loss"] = "another"
+        data["provenance"] |= recorded.own(cell.out, split_control=True, family_seconds=7.0)  # more than was asked for
+        recorded.written(cell.out / "probe", data, arrays)
+        assert missing(cell, with_probe) == missing(cell, control) == []
+        for other in ({"loss": "3dgs", "seed": 1}, {"quick": True}):
+            data["provenance"] |= recorded.own(cell.out, **other)
+            recorded.written(cell.out / "probe", data, arrays)
+            assert missing(cell, with_probe) == ["probe"]
+        data["provenance"] |= recorded.own(cell.out)
+        data["provenance"]["fingerprint"] |= {"formulas": FORMULAS + 1}  # no reason to do it again
+        recorded.written(cell.out / "probe", data, arrays)
+        assert missing(cell, with_probe) == []
+        data["provenance"]["fingerprint"] |= {"state": "of another"}
         recorded.written(cell.out / "probe", data, arrays)
         assert missing(cell, with_probe) == ["probe"]
     finally:
         shutil.rmtree(cell.out / "probe")
+    scores = cell.out / "metrics.json"
+    text, state = scores.read_text(), load_checkpoint(cell.out / "checkpoint.pt").state
+    scores.write_text(text.replace(state, "of another"))
+    assert missing(cell, finished) == ["train"]  # which scores again
+    scores.write_text(text)
+    assert missing(cell, finished) == []
 
 
 def test_the_results_are_the_runs_own_metrics(finished, folder):

@@ -278,7 +278,7 @@ def test_3dgs_looks_through_the_middle_of_images_of_1600_px_at_most(folder, monk
     assert scene.load(found.scene.train)[0].camera.cx == 12.0
     assert opened(path, trained_by=OURS).load_scene(path).frames[0].camera.cx == pytest.approx(12.2)
     monkeypatch.setitem(cast(dict, PRESETS), "graphdeco", replace(PRESETS["graphdeco"], widest=12))
-    assert opened(path, trained_by="graphdeco").scene.sizes[0] == [12, 8]
+    assert opened(path, trained_by="graphdeco").scene.sizes[0] == (12, 8)
 
 
 def test_fewer_views_are_spread_over_the_cameras(folder):
