@@ -41,10 +41,12 @@ def probe_record(
 ) -> ProbeRecord:
     """The record without the families.  timing: seconds of the stages so far."""
     density, left_out = found.density, found.left_out
+    # the others' blocks have full rank: mean 3, log-scales 3, quaternion 3, logit 1
+    seen = {"sh": found.rank - 10 * objective.counts.active_gaussians}
     of_loss = UNSET if left_out is None else sampling_error(left_out.losses, left_out.population)
     return ProbeRecord(
         objective=objective_of(objective, found.value, found.gradient_norm, of_loss),
-        traces={name: _trace(trace, left_out) for name, trace in found.traces.items()},
+        traces={name: _trace(trace, left_out, seen.get(name)) for name, trace in found.traces.items()},
         eigenvalues=_eigenvalues(found, objective),
         anisotropy=_anisotropy(found),
         quantiles=None
@@ -159,8 +161,9 @@ def index_of(bracket: Bracket) -> schema.Index:
     return convert(bracket.record(), schema.Index)
 
 
-def _trace(trace: TraceEstimate, left_out: LeftOut | None) -> schema.Trace:
-    numbers = trace.record()
+def _trace(trace: TraceEstimate, left_out: LeftOut | None, rank: int | None) -> schema.Trace:
+    """rank: of the block, where it is below its size: for colours, the directions that some view sees."""
+    numbers = {**trace.record(), **({} if rank is None else {"dim": rank})}
     method = "exact, the coupling of pixels sampled with random signs" if numbers["probes"] else "exact"
     tau = curvature_scale(numbers["value"] or 0.0, numbers["dim"], 1, "active")
     found = convert({**numbers, "tau": tau, "method": method}, schema.Trace)

@@ -107,7 +107,7 @@ class TraceOf(Struct, kw_only=True):
 
 
 class Trace(TraceOf, kw_only=True):
-    """Trace of one attribute's block over its active parameters.  tau: sqrt(max(value, 0) / dim), its curvature scale."""
+    """Trace of one attribute's block.  dim: its directions that are not exactly flat; tau: sqrt(max(value, 0) / dim)."""
 
     tau: Number
 

@@ -209,7 +209,7 @@ class ObjectiveHessian:
             raise InputError(
                 "expected a loss that leaves its point as it is, got one that changes it in place; copy it first"
             )
-        gradient = [None]
+        gradient: list[Tensor | None] = [None]
         if value.requires_grad:
             with _in_a_sentence(REMEDIES_TWICE):
                 value = value if weight == 1 else weight * value

@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.operators.operator import require_vectors
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.losses.protocols import ViewLoss
 from splat.losses.reference import LossSettings
@@ -138,6 +139,8 @@ class LinearizedView:
 
     def vjp(self, G: Float[Tensor, "k 4 h w"]) -> Float[Tensor, "p k"]:
         """J^T G for cotangents of colour and accumulated alpha."""
+        if G.dtype != self.gaussians.flat.dtype:
+            raise ValueError(f"expected cotangents of {self.gaussians.flat.dtype}, got {G.dtype}; use G.to(...)")
         return self._pullback([self._raster.backward(self._raster.pad(g)) for g in G])
 
     def hvp(
@@ -185,6 +188,8 @@ class LinearizedView:
         return self._loss.curvatures(self._tangent(U).planes)
 
     def _tangent(self, U: Float[Tensor, "p k"]) -> Tangent:
+        flat = self.gaussians.flat
+        require_vectors(U, flat.numel(), flat.dtype, flat.device)
         return self._raster.jvp(self._projection.jvp(U))
 
     def _adjoint_tangent(self, U: Float[Tensor, "p k"], coupled: bool) -> Float[Tensor, "n k 9"]:

@@ -13,6 +13,7 @@ from triton import cdiv
 from splat.gpu import loss_kernels as kernels
 from splat.gpu.language.compile import launch
 from splat.losses.formulas import KINDS, SECONDS
+from splat.losses.protocols import require_planes
 from splat.losses.reference import LossSettings, beyond, window
 
 BLOCK = 256
@@ -108,6 +109,7 @@ class CudaViewLoss(CudaImageLoss):
 
     def _evaluate(self, image: Tensor, slopes: bool, second: bool) -> tuple[Tensor, ...]:
         """The loss, the gradient, the residual, S's second derivatives and blur(S_p); empty what is not asked for."""
+        require_planes(image, self.target)
         residual, sums = image[:3] - self.target, self.sums()
         gradient = self.like.new_zeros(4, *self.shape) if slopes else self.like
         first = bends = sp = self.like

@@ -10,6 +10,18 @@ from typing import Any, Protocol
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
+
+
+def require_planes(image: Float[Tensor, "k H W"], target: Float[Tensor, "3 H W"]) -> None:
+    """Raise InputError unless an image is of the dtype, device and padding of a target: kernels would read other memory."""
+    found, wanted = [(part.dtype, part.device, tuple(part.shape[-2:])) for part in (image, target)]
+    if found != wanted:
+        raise InputError(
+            "expected an image like the loss's target, {} on {} and padded to {}, ".format(*wanted)
+            + "got {} on {} padded to {}; make Gaussians and loss of one kind, as by `Gaussians.to`".format(*found)
+        )
+
 
 class LinearLoss(Protocol):
     """A loss, linearised at an image: value, gradient (that of alpha is 0), and products with its second derivative l''."""

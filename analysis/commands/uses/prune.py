@@ -98,11 +98,12 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
 
 
 def _require_sensible(options: PruneOptions) -> None:
-    if not 0 < options.keep <= 1 or options.refine < 0 or options.curve_steps < 0 or options.sample < 3:
-        raise InputError(
-            f"expected --keep in (0, 1], steps of at least 0 and --sample of at least 3, got {options.keep:g}, "
-            f"{options.refine}, {options.curve_steps} and {options.sample}"
-        )
+    if not 0 < options.keep <= 1:
+        hint = f"; for {options.keep:g}% say --keep {options.keep / 100:g}" if 1 < options.keep <= 100 else ""
+        raise InputError(f"expected --keep as a share above 0 and up to 1, got {options.keep:g}{hint}")
+    for name, least in {"refine": 0, "curve_steps": 0, "sample": 3}.items():
+        if (value := getattr(options, name)) < least:
+            raise InputError(f"expected --{name.replace('_', '-')} of at least {least}, got {value}")
     if options.score not in SCORES:
         raise InputError(
             f"expected --score {', '.join(SCORES)}, got {options.score!r}{did_you_mean(options.score, SCORES)}"

@@ -9,9 +9,10 @@ over the views seen so far and a prior, and C that of a candidate, by Gaussian:
     t           tr B^-1 C
     e           ln of how much the least eigenvalue of B grows, in units of the prior, summed
     d_diagonal  d of the diagonals alone
-    published   FisherRF's score (Jiang et al. 2024), sum over parameters c / (b + 1e-6) for the diagonals of the squared *sum
-                over the channels* of the derivatives, in which opposite channels cancel: here that of Gaussians whose red is
-                the sum of their channels, which is the same but where one is clamped at 0
+    published   FisherRF's score (Jiang et al. 2024), sum over parameters but rotations, which its code leaves out, of
+                c / (b + 1e-6) for the diagonals of the squared *sum over the channels* of the derivatives, in which opposite
+                channels cancel: here that of Gaussians whose red is the sum of their channels, which is the same but where
+                one is clamped at 0
 
 Prior: precisions that are PRIOR times the mean of the training views' diagonals, one for each attribute.  It stands for what
 is known without any view, and decides what a Gaussian that none has seen yet is worth.
@@ -36,6 +37,7 @@ from splat.render.backend import backend_of
 GAINS = ("d", "t", "e", "d_diagonal", "published")
 PRIOR = 1e-3
 FISHERRF_LAMBDA = 1e-6
+UNTURNED = [*range(6), 10]  # of the 11 columns of a Gaussian's geometry: those of mean, log-scales and opacity
 COLUMNS = {"means": slice(0, 3), "log_scales": slice(3, 6), "quats": slice(6, 9), "opacity_logits": slice(9, 10)}
 
 
@@ -71,7 +73,7 @@ def information(
     values, vectors = torch.linalg.eigh(on_complement(blocks.geometry.double(), quats))
     geometry = (vectors * values.clamp_min(0)[:, None]) @ vectors.mT
     grey = _squares(channel_sum(gaussians), camera, _red(background.sum()), settings)
-    own, sh = on_complement(grey.geometry.double(), quats).diagonal(dim1=1, dim2=2), blocks.sh.double()
+    own, sh = grey.geometry.double().diagonal(dim1=1, dim2=2)[:, UNTURNED], blocks.sh.double()
     return Information(geometry, sh, torch.cat([own.clamp_min(0), sh.flatten(1)], dim=1))
 
 

@@ -13,9 +13,13 @@ derivative of the image: it is Gauss-Newton's, and with the stored logit z, d om
     rise = -omega L_omega + omega^2 / 2 H_omega,omega = -g_z / (1 - omega) + G_zz / (2 (1 - omega)^2)
 
 where G_zz has SSIM's coupling of pixels.  For the L2 loss that is the change itself, but where alpha is cut, capped, or a pixel
-stops; under L1 residuals that change sign are not seen.  Eigenvalues below d eps times the
-block's largest, which few views determine, count as that much.
+stops; under L1 residuals that change sign are not seen.  It is taken at logits of OPAQUE at most, which draw the same pictures
+to 6e-6: beyond, 1 - omega is soon rounded to 0, and both quotients to 0 / 0.  Eigenvalues below d eps times the block's
+largest, which few views determine, count as that much.
 """
+
+from copy import copy
+from functools import cached_property
 
 import torch
 from jaxtyping import Float64, Int64
@@ -27,6 +31,7 @@ from splat.curvature.objective import SceneObjective
 
 EXACT = ("rise", "rise_l2", "log_det_6", "log_det_11", "gn_diagonal")
 SCORES = (*EXACT, "opacity", "size_opacity")
+OPAQUE = 12.0  # a logit at which 1 - omega is 6e-6, a hundred units of round-off in single precision
 GONE = -50.0  # a logit with which a Gaussian is drawn nowhere
 
 
@@ -61,10 +66,26 @@ def removal_scores(objective: SceneObjective, l2: SceneObjective) -> dict[str, F
 
 def predicted_rise(objective: SceneObjective) -> Float64[Tensor, " n"]:
     """The second-order rise of the loss when each active Gaussian alone is removed."""
+    objective = _below_opaque(objective)
     z = objective.active.opacity_logits.double()
     slope = objective.gradient[objective.blocks["opacity_logits"]].double()
     curvature = objective.exact_blocks[1].geometry[:, 10, 10].double()
-    return -slope / (-z).sigmoid() + curvature / (2 * (-z).sigmoid().square())
+    double = objective.settings.antialias != "none" or objective.active.filter_widths is not None
+    # 1 - omega, rounded as it is where the derivatives are computed
+    left = 1 - z.sigmoid().to(torch.float64 if double else objective.active.flat.dtype).double()
+    return -slope / left + curvature / (2 * left.square())
+
+
+def _below_opaque(objective: SceneObjective) -> SceneObjective:
+    """The objective, with logits of OPAQUE at most."""
+    if not (objective.active.opacity_logits > OPAQUE).any():
+        return objective
+    same, flat = copy(objective), objective.active.flat.clone()
+    for name in [name for name in vars(same) if isinstance(getattr(SceneObjective, name, None), cached_property)]:
+        del vars(same)[name]  # of the logits as they are
+    flat[objective.blocks["opacity_logits"]].clamp_(max=OPAQUE)
+    same.active = objective.active.with_flat(flat)
+    return same
 
 
 def removal_errors(

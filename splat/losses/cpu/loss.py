@@ -27,6 +27,7 @@ from splat.losses.cpu.sweeps import (
 )
 from splat.losses.cpu.window import RING, Frame, moments_rows
 from splat.losses.formulas import KINDS, SECONDS
+from splat.losses.protocols import require_planes
 from splat.losses.reference import LossSettings, beyond, window
 
 RINGS = 5 << 18  # bytes of rings in a sweep: with more, another vector costs more cache than it shares
@@ -88,6 +89,8 @@ class CpuImageLoss:
         self, x: Float[Tensor, "3 H W"], y: Float[Tensor, "3 H W"]
     ) -> tuple[Float[Tensor, ""], Float[Tensor, "2 3 H W"]]:
         gradients = self.planes(2)
+        for image in (x, y):
+            require_planes(image, torch.from_numpy(gradients[0]))
         gradients[:, :, self.frame.height :] = 0
         flat = *gradients.reshape(2, -1), np.empty(0, self.dtype)
         value = self._sweep(x.numpy().reshape(-1), y.numpy().reshape(-1), None, *flat)
@@ -107,7 +110,8 @@ class CpuViewLoss(CpuImageLoss):
 
     def _against(self, image: Float[Tensor, "k H W"]) -> tuple[np.ndarray, ...]:
         """The image's three planes, the target's, and the latter's moments, flat."""
-        x = np.ascontiguousarray(image[:3].numpy(), self.dtype)
+        require_planes(image, torch.from_numpy(self.target))
+        x = np.ascontiguousarray(image[:3].numpy())
         return x.reshape(-1), self.target.reshape(-1), self._target_moments.reshape(-1)
 
     def value(self, image: Float[Tensor, "k H W"]) -> float:

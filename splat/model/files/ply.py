@@ -99,7 +99,7 @@ def read_header(content: bytes) -> Header:
     if not content.startswith(MAGIC) or end < 0 or newline < 0:
         raise InputError("it does not begin with the header of a PLY file")
     order, comments, elements = None, [], []
-    for line in content[:end].decode("utf-8", errors="replace").splitlines()[1:]:
+    for line in content[:end].decode("utf-8", errors="replace").split("\n")[1:]:  # no other character ends a line
         match line.split(maxsplit=1)[:1], line.split():
             case ["comment" | "obj_info"], _:
                 comments.append(line.split(maxsplit=1)[1] if len(line.split()) > 1 else "")

@@ -2,7 +2,8 @@
 
     .splat           32 bytes each: means and scales as float32, colour and opacity, quaternion (128 q + 128) in 8 bits
     compressed PLY   chunks of 256 with their ranges, 11 or 10 bits a number within them (PlayCanvas)
-    .spz             Niantic's: gzip, from version 4 on zstd; its axes y and z point against those of a PLY
+    .spz             Niantic's: gzip, from version 4 on zstd; its axes y and z point against those of a PLY, but many
+                     converters leave them as they are (`SplatFile.other_axes`)
     .sog             a zip of WebP textures (PlayCanvas)
 
 .splat is read here, the others with gsply (an optional package); what they promise is compared with what they have before.
@@ -16,6 +17,7 @@ import tempfile
 import warnings
 import zipfile
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from PIL import Image
 from landscape.errors import InputError, lacks_memory
 from splat.model.files.ply import Header, read_header, read_rows
 from splat.model.files.splat_file import SplatFile, clamped_note, logit, packed
+from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00, harmonics
 
 SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -113,7 +116,7 @@ def read_spz(content: bytes) -> SplatFile:
         alpha = np.frombuffer(whole, np.uint8, n, SPZ_HEADER.size + 9 * n)
         clamped = int(((alpha == 0) | (alpha == 255)).sum())
     found = _from_gsply("read_spz", content, f".spz version {version}", clamped, antialiased=bool(flags & 1))
-    return _turned(found)
+    return replace(found, gaussians=_turned(found.gaussians), other_axes=found.gaussians)
 
 
 def _inflated(content: bytes, size: int) -> bytes:
@@ -124,16 +127,17 @@ def _inflated(content: bytes, size: int) -> bytes:
         raise InputError(f"its compressed bytes are damaged ({error})") from error
 
 
-def _turned(found: SplatFile) -> SplatFile:
+def _turned(found: Gaussians) -> Gaussians:
     """The same with its axes y and z turned round, from .spz's right, up, back to a PLY's right, down, front."""
-    attributes = found.gaussians.attributes
+    gaussians = found.with_flat(found.flat.clone())
+    attributes = gaussians.attributes
     attributes["means"] *= torch.tensor([1.0, -1.0, -1.0])
     attributes["quats"] *= torch.tensor(QUATERNION_AXES)
     direction = torch.tensor([[0.48, 0.6, 0.64]])  # on no plane where a harmonic vanishes
-    degree = found.gaussians.sh_degree
+    degree = found.sh_degree
     signs = harmonics(direction * torch.tensor([1.0, -1.0, -1.0]), degree) / harmonics(direction, degree)
     attributes["sh"] *= signs.sign()[..., None]
-    return found
+    return gaussians
 
 
 def is_sog(archive: zipfile.ZipFile) -> bool:

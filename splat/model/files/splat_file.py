@@ -21,7 +21,8 @@ class SplatFile:
     format: in words.  tool: who trained them, a name of `splat.training.origin.presets`; None where the file does not say.
     step: training steps.  antialiased: whether the renderer scaled opacities by the blur.  lossy: whether they were rounded to
     a few bits.  extra: further numbers of each Gaussian, by name.  settings: of the tool, by its names.  train: names of the
-    images it trained on.  notes: sentences on what was changed or is unsure.
+    images it trained on.  notes: sentences on what was changed or is unsure.  other_axes: the same Gaussians with y and z
+    turned round, where writers of the format differ in that.
     """
 
     gaussians: Gaussians
@@ -33,6 +34,7 @@ class SplatFile:
     extra: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    other_axes: Gaussians | None = None
 
 
 def packed(attributes: Mapping[str, np.ndarray], filter_widths: np.ndarray | None = None) -> Gaussians:
@@ -65,6 +67,14 @@ def logit(opacity: np.ndarray) -> tuple[np.ndarray, int]:
     inside = np.clip(opacity, 0.5 / 255, 1 - 0.5 / 255)
     inside = np.where((opacity > 0) & (opacity < 1), opacity, inside)
     return np.log(inside / (1 - inside)), int(((opacity <= 0) | (opacity >= 1)).sum())
+
+
+def finite_logits(logits: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Logits with those of the opacities 0 and 1, which are infinite, moved inside as `logit` does; and a note on them."""
+    ends, _ = logit(np.array([0.0, 1.0]))
+    count = int(np.isinf(logits).sum())
+    note = f"{count} opacities of 0 or 1, whose logits are infinite, were moved inside by half of 1/255"
+    return np.where(np.isinf(logits), np.where(logits > 0, ends[1], ends[0]), logits), (note,) if count else ()
 
 
 def clamped_note(count: int) -> tuple[str, ...]:

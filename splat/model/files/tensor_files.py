@@ -5,7 +5,8 @@
     gsplat      ckpt_STEP_rankR.pt: {"step", "splats": {means, scales, quats, opacities, sh0 (n, 1, 3), shN (n, k, 3)}}; the
                 ranks of one training have a share of the Gaussians each
     splatfacto  step-STEP.ckpt: {"step", "pipeline": {"_model.gauss_params.means": ...}}, in older files "_model.means";
-                features_dc (n, 3), features_rest (n, k, 3).  At SH degree 0 features_dc are logits of colours
+                features_dc (n, 3), features_rest (n, k, 3).  At SH degree 0 features_dc are logits of colours.  Trained on
+                several GPUs or compiled, the names have "module." or "_orig_mod." in between
 
 Nothing in such a file can run code: `weights_only=True`, with the NumPy scalars that the tools leave in them allowed by name.
 """
@@ -23,14 +24,18 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
-from splat.model.files.splat_file import SplatFile, packed
+from splat.model.files.splat_file import SplatFile, finite_logits, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.model.untrusted import require_whole
 
+UNAPPLIED = "{}, which changed its images in training, is not applied"
 RANK = re.compile(r"(.*_rank)(\d+)(\.pt)")
 OWN = b"splat-landscape checkpoint"
-NERFSTUDIO = ("_model.gauss_params.", "_model.")
+WRAPPED = r"(?:(?:module|_orig_mod)\.)*"
+NERFSTUDIO = re.compile(rf"({WRAPPED}_model\.{WRAPPED}(?:gauss_params\.)?)means")
+MOVED = re.compile(r"camera_opt|bil_grid|appearance|exposure")  # in names of what splatfacto fits beside Gaussians
+FORBIDDEN = re.compile(r"GLOBAL ([\w.]+)|class(?:es)? ([\w.]+)")  # in torch's words on a pickle with other objects
 NUMPY_TYPES = ("Float64DType", "Float32DType", "Int64DType", "Int32DType", "BoolDType")
 
 
@@ -74,8 +79,20 @@ def load_tensors(content: bytes) -> Any:
     except Exception as error:  # a damaged file fails in torch in many ways
         if lacks_memory(error):
             raise
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise InputError(f"it is damaged, or holds more than tensors and numbers: {reason[:200]}") from error
+        raise InputError(f"it is damaged, or holds more than tensors and numbers: {torch_reason(error)}") from error
+
+
+def torch_reason(error: Exception) -> str:
+    """Why torch did not load a file: the kind of object in it that is not allowed, else its words, without its advice.
+
+    >>> torch_reason(RuntimeError("Weights only load failed. ... Unsupported global: GLOBAL pathlib.PosixPath was not ..."))
+    'a pathlib.PosixPath; save it again without that'
+    """
+    words = "".join(letter if letter.isprintable() else " " for letter in str(error))
+    if "weights" in words.lower() and (found := FORBIDDEN.search(words)):
+        return f"a {found[1] or found[2]}; save it again without that"
+    sentence = re.split(r"\. |  ", words.strip() or type(error).__name__)[0]
+    return "objects of Python that could run code" if "weights_only" in sentence.lower() else sentence[:200]
 
 
 def _numpy_scalars() -> list[Any]:
@@ -111,17 +128,18 @@ def _step(value: Any) -> int | None:
 
 def _graphdeco(captured: Any, iteration: Any) -> SplatFile:
     constant, rest = _array(captured, 2, None, 1, 3), _array(captured, 3, None, None, 3)
-    active, notes = captured[0], ()
+    active = captured[0]
+    logits, notes = finite_logits(_array(captured, 6, None, 1)[:, 0])
     sh = _joined(constant, rest)
     if isinstance(active, int) and 0 <= active < 4 and (active + 1) ** 2 < sh.shape[1]:
-        notes = (f"SH bands above degree {active}, which the training had not reached, were left out",)
+        notes += (f"SH bands above degree {active}, which the training had not reached, were left out",)
         sh = sh[:, : (active + 1) ** 2]
     gaussians = packed(
         {
             "means": _array(captured, 1, None, 3),
             "log_scales": _array(captured, 4, None, 3),
             "quats": _array(captured, 5, None, 4),
-            "opacity_logits": _array(captured, 6, None, 1)[:, 0],
+            "opacity_logits": logits,
             "sh": sh,
         }
     )
@@ -135,13 +153,18 @@ def _joined(constant: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 def _other_ranks(path: Path) -> list[Path]:
-    """The files of the other ranks, in their order.  InputError where one is named that is not the first."""
+    """The files of the other ranks, in their order.  InputError where one is missing, or one named that is not the first."""
     match = RANK.fullmatch(path.name)
     if not match:
         return []
     if match[2] != "0":
         raise InputError(f"it is one share of a training; name the first, {match[1]}0{match[3]}, all are then read")
-    found = {int(m[2]): file for file in path.parent.iterdir() if (m := RANK.fullmatch(file.name)) and m[1] == match[1]}
+    named = [(m, file) for file in path.parent.iterdir() if (m := RANK.fullmatch(file.name)) and m[1] == match[1]]
+    found = {int(m[2]): file for m, file in named}
+    missing = [str(rank) for rank in range(max(found) + 1) if rank not in found]
+    if missing or len(found) < len(named):
+        what = f"without {', '.join(missing[:5])}: a share of the scene is missing" if missing else "one of them twice"
+        raise InputError(f"its ranks are {', '.join(map(str, sorted(found)))}, {what}")
     return [found[rank] for rank in sorted(found) if rank]
 
 
@@ -167,9 +190,10 @@ def _gsplat(ranks: list[Any]) -> SplatFile:
     if len({part["sh"].shape[1] for part in parts}) > 1:
         raise InputError("its ranks have different SH degrees")
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    first, notes = ranks[0], ()
+    whole["opacity_logits"], notes = finite_logits(whole["opacity_logits"])
+    first = ranks[0]
     if kinds := [key for key in ("pose_adjust", "app_module", "post_processing") if key in first]:
-        notes = (f"{', '.join(kinds)}, which changed its images in training, is not applied",)
+        notes += (UNAPPLIED.format(", ".join(kinds)),)
     tool = first.get("trained_by")
     extra = {key: _array(first["extra"], key, len(whole["means"])) for key in first.get("extra") or {}}
     return SplatFile(
@@ -215,23 +239,28 @@ def gsplat_bytes(
 
 def _splatfacto(content: Mapping[str, Any]) -> SplatFile:
     state = content["pipeline"]
-    prefix = next((p for p in NERFSTUDIO if f"{p}means" in state), None)
+    names = [name for name in state if isinstance(name, str)]
+    prefix = next((found[1] for name in names if (found := NERFSTUDIO.fullmatch(name))), None)
     if prefix is None:
         raise InputError("its pipeline has no Gaussians; expected a checkpoint of splatfacto")
     constant, rest = (
         _array(state, f"{prefix}features_dc", None, 3),
         _array(state, f"{prefix}features_rest", None, None, 3),
     )
-    notes: tuple[str, ...] = ()
+    logits, notes = finite_logits(_array(state, f"{prefix}opacities", None, 1)[:, 0])
+    if moved := [
+        name for name in names if MOVED.search(name) and isinstance(state[name], Tensor) and state[name].any()
+    ]:
+        notes += (UNAPPLIED.format(", ".join(name.rpartition("_model.")[2] for name in moved[:3])),)
     if not rest.shape[1]:
         constant = (1 / (1 + np.exp(-constant.astype(np.float64))) - 0.5) / Y00
-        notes = ("splatfacto's colours of SH degree 0 are logits; curvature is in the colours' harmonics instead",)
+        notes += ("splatfacto's colours of SH degree 0 are logits; curvature is in the colours' harmonics instead",)
     gaussians = packed(
         {
             "means": _array(state, f"{prefix}means", None, 3),
             "log_scales": _array(state, f"{prefix}scales", None, 3),
             "quats": _array(state, f"{prefix}quats", None, 4),
-            "opacity_logits": _array(state, f"{prefix}opacities", None, 1)[:, 0],
+            "opacity_logits": logits,
             "sh": _joined(constant[:, None], rest),
         }
     )

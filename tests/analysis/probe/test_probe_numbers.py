@@ -14,6 +14,7 @@ from analysis.records.findings import findings
 from analysis.records.quantities import measured
 from analysis.records.tables import probe_table
 from landscape import DenseOperator, EigenSettings, PowerSettings, extreme_eigenpairs, power_ends
+from splat.curvature.hessian import SceneHessian
 from tests.recorded import soft
 
 ATTRIBUTES = ["means", "log_scales", "quats", "opacity_logits", "sh"]
@@ -33,8 +34,9 @@ def test_traces_are_within_four_standard_errors_of_the_dense_hessian(record, den
         assert abs(trace.value - exact) <= 4 * trace.standard_error + rounding(H), name
         size = float(H[rows, rows].diagonal().abs().sum())
         assert trace.standard_error < 0.1 * size, name  # so that the line above says something
-        each = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 3 * objective.active.sh.shape[1]}
-        assert trace.dim == len(objective.active) * each[name]
+        each = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1}
+        seen = SceneHessian(objective).projector.seen.rank  # of colours
+        assert trace.dim == (int(seen.sum()) if name == "sh" else len(objective.active) * each[name])
         assert trace.tau == math.sqrt(max(trace.value, 0) / trace.dim)
         samples = record.arrays["traces"][name]  # none of an exact trace
         assert not len(samples) or samples.mean() == pytest.approx(trace.value, rel=1e-12)

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from splat.backend.cpu.simd import lanes_of
+from splat.curvature.hessian import SceneHessian
 from splat.curvature.linearize import LinearizedView
+from splat.curvature.objective import SceneObjective
 from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings, photometric_loss
 from splat.model.gaussians import Gaussians
@@ -200,6 +202,27 @@ def test_what_a_product_takes_is_free_before_its_result_is_made():
     tracemalloc.stop()
     cotangents = 4 * 9 * U.shape[1] * len(gaussians)  # of the splats: what the result is made of
     assert result.nbytes + cotangents <= peak <= result.nbytes + 1.5 * cotangents
+
+
+def test_gaussians_vectors_and_images_of_another_dtype_are_refused():
+    gaussians, views = random_gaussians(8, sh_degree=1, seed=4), two_views()
+    objective = SceneObjective(gaussians, views, LossSettings(), BACKGROUND.float())
+    double = objective.active.to(torch.float64)
+    view = objective.linearizer(objective.active)(0)
+    vectors = torch.ones(len(double.flat), 1, dtype=torch.float64)
+    refused = [
+        lambda: objective.linearizer(double)(0),
+        lambda: objective.loss(double.flat),
+        lambda: objective.evaluate_view(0, double),
+        lambda: view.hvp(vectors),
+        lambda: view.ggn(vectors),
+        lambda: view.jvp(vectors),
+        lambda: view.vjp(view.image.new_ones(1, 4, *view.image.shape[1:], dtype=torch.float64)),
+        lambda: SceneHessian(objective).apply(vectors),
+    ]
+    for call in refused:
+        with pytest.raises(ValueError, match=r"expected .*torch\.float32.* got .*torch\.float64"):
+            call()
 
 
 def test_what_no_pixel_sees_has_no_derivative():

@@ -103,7 +103,15 @@ def test_a_curve_that_is_stopped_goes_on(folder, curved, tmp_path, monkeypatch):
     assert not (tmp_path / ".out.unfinished").exists()
 
 
-@pytest.mark.parametrize("words", [("--keep", "0"), ("--score", "opacty"), ("--sample", "1")])
-def test_what_cannot_be_is_refused(folder, words, capsys):
+@pytest.mark.parametrize("words", [
+    ("--keep", "0"), ("--score", "opacty"), ("--sample", "1"), ("--refine", "-1"), ("--curve-steps", "-2")
+])  # fmt: skip
+def test_what_cannot_be_is_refused_alone(folder, words, capsys):
     assert run(folder, *words) == 2
-    assert "expected --" in capsys.readouterr().err
+    sentence = capsys.readouterr().err
+    assert f"expected {words[0]} " in sentence
+
+
+def test_a_share_in_percent_is_said(folder, capsys):
+    assert run(folder, "--keep", "50") == 2
+    assert "got 50; for 50% say --keep 0.5" in " ".join(capsys.readouterr().err.split())

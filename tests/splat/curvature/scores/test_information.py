@@ -45,7 +45,7 @@ def dense(gaussians: Gaussians, camera) -> list[dict[str, np.ndarray]]:
         E[:6, :6], E[6:10, 6:9], E[10, 9] = np.eye(6), turns, 1
         own = E.T @ J[np.concatenate([rows[name][i] for name in GEOMETRY_COLUMNS])].reshape(11, -1)
         sh = (J[rows["sh"][i]] ** 2).sum(axis=(1, 2))
-        summed = (own.reshape(10, 3, -1).sum(axis=1) ** 2).sum(axis=1)
+        summed = (own.reshape(10, 3, -1).sum(axis=1) ** 2).sum(axis=1)[[0, 1, 2, 3, 4, 5, 9]]  # FisherRF's: no rotation
         found.append({"block": own @ own.T, "sh": sh, "summed": np.concatenate([summed, sh])})
     return found
 

@@ -53,6 +53,19 @@ def test_for_squared_errors_the_prediction_is_the_true_rise():
     assert (true.abs() > 0).all() and (rise - true).abs().max() <= 1e-10 * true.abs().max()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("logit", [15.0, 38.0, 120.0])
+def test_opaque_gaussians_are_scored_by_their_removal(logit, dtype):
+    gaussians = random_gaussians(8, sh_degree=1, seed=4, logit=-0.5, spread=0.5).to(dtype)
+    gaussians.opacity_logits[:4] = logit
+    objective = SceneObjective(gaussians, two_views(), L2, BACKGROUND.to(dtype), SMOOTH)
+    rise = removal_scores(objective, objective)["rise_l2"]
+    true = removal_errors(objective, torch.arange(len(rise)))
+    # the loss, and so its change, is known to round-off
+    bound = 1e-8 * true.abs() + 100 * torch.finfo(dtype).eps * objective.loss(objective.active.flat)
+    assert (true[:4].abs() > 10 * bound[:4]).all() and ((rise - true).abs() <= bound).all(), (rise, true)
+
+
 def test_log_determinants_are_those_of_the_dense_jacobian():
     objective = toy(L2, 3)  # two views leave some blocks singular
     scores, active = removal_scores(objective, objective), objective.active

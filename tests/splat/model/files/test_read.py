@@ -3,6 +3,8 @@
 import io
 import zipfile
 from copy import copy
+from datetime import datetime
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 
@@ -94,6 +96,14 @@ def test_the_ranks_of_gsplat_concatenate_in_their_order(tmp_path):
     assert torch.equal(read_splats(tmp_path / "ckpt_10_rank0.pt").gaussians.flat, whole.flat)
     with pytest.raises(InputError, match=r"name the first, ckpt_10_rank0\.pt"):
         read_splats(tmp_path / "ckpt_10_rank1.pt")
+    stored(tmp_path, "ckpt_10_rank01.pt", written.gsplat_pt(scene(), 10))
+    with pytest.raises(InputError, match="ranks are 0, 1, 2, 3, one of them twice"):
+        read_splats(tmp_path / "ckpt_10_rank0.pt")
+    (tmp_path / "ckpt_10_rank01.pt").unlink()
+    share = (tmp_path / "ckpt_10_rank1.pt").rename(tmp_path / "elsewhere.pt")
+    with pytest.raises(InputError, match="ranks are 0, 2, 3, without 1: a share of the scene is missing"):
+        read_splats(tmp_path / "ckpt_10_rank0.pt")
+    share.rename(tmp_path / "ckpt_10_rank1.pt")
     stored(tmp_path, "ckpt_10_rank2.pt", written.gsplat_pt(scene(), 11))
     with pytest.raises(InputError, match="another step"):
         read_splats(tmp_path / "ckpt_10_rank0.pt")
@@ -109,6 +119,99 @@ def test_splatfactos_constant_colours_are_logits(tmp_path):
     found = read_splats(stored(tmp_path, "c.ckpt", written.splatfacto(scene(0)))).gaussians
     colour = 0.5 + found.sh[:, 0].double() / (4 * np.pi) ** 0.5
     torch.testing.assert_close(colour, scene(0).sh[:, 0].double().sigmoid(), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("prefix", ["_model.module.gauss_params.", "module._model.gauss_params.", "_orig_mod._model."])
+def test_a_splatfacto_that_was_wrapped_for_several_gpus_or_compiled_is_read(tmp_path, prefix):
+    found = read_splats(stored(tmp_path, "c.ckpt", written.splatfacto(scene(), prefix))).gaussians
+    assert torch.equal(found.flat, scene().flat)
+
+
+FITTED = [
+    "_model.camera_optimizer.pose_adjustment",
+    "_model.module.bil_grids.grids",
+    "datamanager.train_camera_optimizer.pose",
+]
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_what_splatfacto_fitted_beside_gaussians_is_said_where_it_is_not_zero(tmp_path, name):
+    content = load_tensors(written.splatfacto(scene()))
+    for fitted, count in ((torch.zeros(3, 6), 0), (torch.ones(3, 6), 1)):
+        content["pipeline"][name] = fitted
+        notes = read_splats(stored(tmp_path, "c.ckpt", written.saved(content))).notes
+        assert [note.endswith("is not applied") for note in notes] == [True] * count
+
+
+INFINITE = {
+    "a.ply": written.columns,
+    "b.pth": written.graphdeco_pth,
+    "ckpt_1.pt": written.gsplat_pt,
+    "c.ckpt": written.splatfacto,
+}
+
+
+@pytest.mark.parametrize("name", INFINITE)
+def test_opacities_of_exactly_0_and_1_are_moved_inside_and_counted(tmp_path, name):
+    whole = scene()
+    whole.opacity_logits[:3] = torch.tensor([np.inf, -np.inf, np.inf])
+    content = INFINITE[name](whole)
+    found = read_splats(stored(tmp_path, name, ply(content) if isinstance(content, dict) else content))
+    opacities = found.gaussians.opacity_logits[:3].sigmoid()
+    torch.testing.assert_close(opacities, torch.tensor([1 - 0.5 / 255, 0.5 / 255, 1 - 0.5 / 255]), rtol=1e-5, atol=0)
+    assert found.notes[0].startswith("3 opacities of 0 or 1,")
+    assert torch.equal(found.gaussians.opacity_logits[3:], scene().opacity_logits[3:])
+
+
+@pytest.mark.parametrize("letter", ["\x0b", "\x0c", "\x1c", "\x85", "\u2028", "\r"])
+def test_only_a_newline_ends_a_line_of_the_header(tmp_path, letter):
+    content = ply(columns(scene()), (f"made{letter}by a tool",))
+    assert torch.equal(read_splats(stored(tmp_path, "a.ply", content)).gaussians.flat, scene().flat)
+
+
+def coloured(kind: str, name: str, white: float) -> bytes:
+    """Three Gaussians whose colours are all of white, 0.2 of it, and none."""
+    kept = {k: v[:3] for k, v in columns(scene(0)).items() if not k.startswith("f_dc")}
+    rows = np.zeros(3, [(k, "<f4") for k in kept] + [(k, "<" + kind) for k in ("red", "green", "blue")])
+    for column, values in {**kept, **dict.fromkeys(("red", "green", "blue"), white * np.array([1, 0.2, 0]))}.items():
+        rows[column] = values
+    head = [
+        f"property {name if rows.dtype[k].str[1:] == kind and k not in kept else 'float'} {k}" for k in rows.dtype.names
+    ]
+    return (
+        "\n".join(["ply", "format binary_little_endian 1.0", "element vertex 3", *head, "end_header\n"]).encode()
+        + rows.tobytes()
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "white"), [("u1", "uchar", 255), ("u2", "ushort", 65535), ("f4", "float", 1), ("f8", "double", 1)]
+)
+def test_white_is_that_of_the_kind_of_colours(tmp_path, kind, name, white):
+    found = read_splats(stored(tmp_path, "a.ply", coloured(kind, name, white)))
+    colours = 0.5 + found.gaussians.sh[:, 0] / (4 * np.pi) ** 0.5
+    torch.testing.assert_close(colours, torch.tensor([1, 0.2, 0])[:, None].expand(3, 3), rtol=0, atol=1e-6)
+    assert found.lossy and "plain colours" in found.notes[0]
+
+
+@pytest.mark.parametrize(("kind", "name", "white"), [("i4", "int", 255), ("f4", "float", 255), ("i2", "short", -1)])
+def test_colours_whose_white_is_not_known_are_refused(tmp_path, kind, name, white):
+    with pytest.raises(InputError, match="not known which one is white"):
+        read_splats(stored(tmp_path, "a.ply", coloured(kind, name, white)))
+
+
+@pytest.mark.parametrize(
+    ("thing", "named"),
+    [
+        (Path("/a"), "pathlib.PosixPath"),
+        (datetime(2020, 1, 1), "datetime.datetime"),
+        (Fraction(1, 2), "fractions.Fraction"),
+    ],
+)
+def test_objects_beside_the_tensors_are_named_without_torchs_advice(tmp_path, thing, named):
+    path = stored(tmp_path, "ckpt_1_rank0.pt", written.saved({"step": 1, "splats": {}, "more": thing}))
+    with pytest.raises(InputError, match=f"more than tensors and numbers: a {named}; save it again without that$"):
+        read_splats(path)
 
 
 def test_mip_splattings_filter_is_kept_and_baked_as_its_own_exporter_does(tmp_path):

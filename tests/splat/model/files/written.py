@@ -131,7 +131,7 @@ def spz(gaussians: Gaussians, flags: int = 0) -> bytes:
     positions = b"".join(int(v).to_bytes(3, "little", signed=True) for v in fixed.ravel())
     unit = p["quats"] / np.linalg.norm(p["quats"], axis=1, keepdims=True) * np.where(p["quats"][:, :1] < 0, -1, 1)
     unit = unit * [1, 1, -1, -1]
-    bands = _odd_in_yz()[: p["sh"].shape[1] - 1, None]
+    bands = odd_in_yz()[: p["sh"].shape[1] - 1, None]
 
     def byte(values: np.ndarray) -> bytes:
         return np.clip(np.round(values), 0, 255).astype(np.uint8).tobytes()
@@ -142,7 +142,7 @@ def spz(gaussians: Gaussians, flags: int = 0) -> bytes:
     return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 2, n, degree, 12, flags, 0) + body)
 
 
-def _odd_in_yz() -> np.ndarray:
+def odd_in_yz() -> np.ndarray:
     """Sign of each harmonic above the constant one when y and z change theirs, by the number of y and z in its polynomial."""
     polynomials = ["y", "z", "x", "xy", "yz", "zz", "xz", "xx", "yxx", "xyz", "yzz", "zzz", "xzz", "zxx", "xxx"]
     return np.array([(-1.0) ** sum(p.count(axis) for axis in "yz") for p in polynomials])

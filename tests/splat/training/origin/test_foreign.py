@@ -3,13 +3,16 @@ trainer; where it is not the picture of its scene, nothing is measured.
 """
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from landscape.errors import InputError
 from splat.curvature.hessian import SceneHessian
@@ -22,7 +25,7 @@ from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import Checkpoint, open_checkpoint, save_checkpoint
 from splat.training.loop import train
-from splat.training.origin.foreign import Foreign
+from splat.training.origin.foreign import LEAST_PSNR, MARGIN, Foreign
 from splat.training.origin.presets import PRESETS
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig, Training
@@ -113,6 +116,57 @@ def test_what_is_not_the_scenes_picture_is_not_measured_and_shown(folder):
         opened(path, trained_by=OURS)
     assert "\n" not in str(caught.value)
     assert path.with_name("mismatch.png").read_bytes().startswith(b"\x89PNG")
+
+
+def faded(folder: Path, contrast: float) -> Path:
+    """The scene with photographs of little contrast."""
+    for path in sorted((folder / "scene" / "images").iterdir()):
+        picture = np.asarray(Image.open(path)) / 255
+        Image.fromarray(np.uint8(255 * (picture.mean() + contrast * (picture - picture.mean())) + 0.5)).save(path)
+    return folder
+
+
+def plain(colour: float) -> Gaussians:
+    """Gaussians that fill every picture with one colour."""
+    g = gaussians().select(torch.arange(4), 0)
+    g.means.mul_(0.01)
+    g.log_scales.fill_(1.0)
+    g.opacity_logits.fill_(6.0)
+    g.sh.fill_((colour - 0.5) * (4 * torch.pi) ** 0.5)
+    return g
+
+
+def test_a_picture_of_one_colour_is_no_likeness_however_low_the_contrast(folder):
+    view = load_scene(faded(folder, 0.2) / "scene").load()[0]
+    path = stored(folder / "a.ply", written.ply(written.columns(plain(float(view.image.mean())))))
+    with pytest.raises(InputError, match=r"is this their scene\?") as caught:
+        opened(path, trained_by=OURS)
+    got, least, one = map(float, re.findall(r"(\d+\.\d)(?: dB|;|\))", str(caught.value)))
+    assert got > LEAST_PSNR and least == pytest.approx(one + MARGIN, abs=0.11)
+
+
+def test_colours_far_beyond_white_are_no_likeness_of_white(folder):
+    g = gaussians()
+    bright = g.sh[:, 0].mean(dim=1) > 0
+    g.sh[bright, 0] = 1e9
+    with pytest.raises(InputError, match=r"got -\d+\.\d dB"):
+        opened(stored(folder / "a.ply", written.ply(written.columns(g))), trained_by=OURS)
+
+
+def test_an_spz_is_read_in_the_axes_in_which_it_looks_like_the_scene(folder):
+    pytest.importorskip("gsply")
+    g = gaussians()
+    g.sh.mul_(0.4)
+    turned = g.with_flat(g.flat.clone())
+    turned.means.mul_(torch.tensor([1.0, -1.0, -1.0]))
+    turned.quats.mul_(torch.tensor([1.0, 1.0, -1.0, -1.0]))
+    signs = torch.from_numpy(written.odd_in_yz()).float()
+    turned.sh[:, 1:].mul_(signs[:, None])
+    both = [
+        opened(stored(folder / f"{i}.spz", written.spz(each)), trained_by=OURS) for i, each in enumerate((g, turned))
+    ]
+    assert torch.equal(both[0].training.gaussians.means, both[1].training.gaussians.means)
+    assert [any("axes are those of a PLY" in note for note in each.origin["notes"]) for each in both] == [False, True]
 
 
 @pytest.mark.parametrize(
