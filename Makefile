@@ -1,5 +1,6 @@
 # make demo   install, train and probe a small synthetic scene
 # make test   install, also the developers' tools, then ruff, pyright and pytest
+# make test-everywhere   the tests as other processors run them, which takes hours
 # make setup  the shared first half: an environment in .venv with everything that the commands need
 # make clean  remove the environment and builds; what you trained and measured, in runs/, stays
 PYTHON ?= python3
@@ -9,7 +10,7 @@ STAMP := $(VENV)/.installed
 TOOLS := $(VENV)/.tools-installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: setup demo test clean
+.PHONY: setup demo test test-everywhere clean
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
@@ -32,6 +33,9 @@ test: $(TOOLS)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
+
+test-everywhere: $(TOOLS)
+	$(BIN)/python -m tests.everywhere
 
 clean:
 	rm -rf $(VENV) build *.egg-info

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from tests.waiting import PATIENCE
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 DRIVER = shutil.which("chromedriver")
 ARGUMENTS = (
@@ -38,7 +40,7 @@ def chromium() -> Iterator[Any]:
         browser.quit()
 
 
-def until(browser: Any, condition: str, seconds: float = 60.0) -> Any:
+def until(browser: Any, condition: str, seconds: float = PATIENCE) -> Any:
     """What a condition in JavaScript comes to as soon as it holds."""
     from selenium.webdriver.support.ui import WebDriverWait
 

@@ -7,6 +7,7 @@ from contextlib import redirect_stdout
 from functools import cache
 from io import StringIO
 from itertools import pairwise
+from math import log2
 from pathlib import Path
 
 import matplotlib as mpl
@@ -15,7 +16,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-COMMANDS = ("quick_start",)  # prints what commands say, which depends on the packages and the window that they find
 
 
 def cells(path: Path) -> list[str]:
@@ -49,7 +49,8 @@ def test_the_curvature_of_the_nerf_is_that_of_its_dense_hessian():
     _, names = story("nerf")
     exact, ends = names["exact"], names["ends"]
     for end, value in ((ends.largest, exact[-1]), (ends.smallest, exact[0])):
-        assert abs(float(end.values[0]) - float(value)) <= float(end.residuals[0]) + 1e-9
+        round_off = len(exact) * np.finfo(float).eps * float(exact.abs().max())  # of either, by Weyl's inequality
+        assert abs(float(end.values[0]) - float(value)) <= float(end.residuals[0]) + 2 * round_off
     for name, rows in names["H"].blocks.items():
         found, truth = names["traces"][name], float(names["dense"].diagonal()[rows].sum())
         assert abs(found.value - truth) <= 4 * found.standard_error
@@ -90,10 +91,12 @@ def test_what_moves_the_index_does_so_as_the_notebook_says():
     dims, ranks, _ = zip(*names["counts"])
     assert dims[-1] > 2 * ranks[-1] and ranks[-1] == ranks[-2]  # three views tell no more of colour
     sizes = [row[1] for row in names["rows"]]
-    assert all(1.5 < before / after < 3 for before, after in pairwise(sizes))  # lambda_max at every split
+    assert all(round(log2(before / after)) == 1 for before, after in pairwise(sizes))  # nearer to 2 than to 1 or 4
     first, *_, last = names["stretched"]
-    assert first[2] < first[1] and last[2] > last[1] and abs(last[1] / first[1] - 1) < 0.1  # the needle took lambda_min
-    assert names["kinked"] < 0.1 * max(names["rounded"])
+    assert first[2] < first[1] and last[2] > last[1]
+    assert names["share"][0] == names["drawn"]  # the needle has the direction of lambda_min
+    assert abs(log2(last[1] / first[1])) < log2(last[2] / first[2])  # lambda_max moved less
+    assert names["kinked"] < max(names["rounded"]) / 2  # most of it is in the kinks
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -106,7 +109,7 @@ def test_a_notebook_uses_public_names_only(path):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_keeps_the_outputs_of_its_cells_as_they_are_and_small(path):
-    """Run in order without an error, with the words that its cells print today; pictures of at most 100 kB.
+    """Run in order without an error, and say what its cells say today; pictures of at most 100 kB.
 
     `jupyter nbconvert --to notebook --execute --inplace notebooks/NAME.ipynb` stores them anew.
     """
@@ -116,9 +119,22 @@ def test_a_notebook_keeps_the_outputs_of_its_cells_as_they_are_and_small(path):
     assert all(output["output_type"] != "error" and output.get("name") != "stderr" for output in outputs)
     pictures = [len(output["data"]["image/png"]) * 3 / 4 for output in outputs if "image/png" in output.get("data", {})]
     assert pictures and max(pictures) <= 100_000 and path.stat().st_size <= 400_000
-    if path.stem not in COMMANDS:
-        stored = "".join(text for output in outputs for text in output.get("text", []))
-        assert words(stored) == words(story(path.stem)[0])
+    stored = "".join(text for output in outputs for text in output.get("text", []))
+    code = ast.parse("\n".join(cells(path)))
+    calls = [node for node in ast.walk(code) if isinstance(node, ast.Call)]
+    printed = [written(call) for call in calls if ast.unparse(call.func) == "print"]
+    assert re.fullmatch(f"({'|'.join(printed)})+", stored) and all(re.search(each, stored) for each in printed)
+    if not any(isinstance(node, ast.ImportFrom) and node.module == "splat" for node in ast.walk(code)):
+        assert words(stored) == words(story(path.stem)[0])  # its numbers are those of a stored table
+
+
+def written(call: ast.Call) -> str:
+    """What a `print` writes, as a regular expression: its own words, which no number decides; a value may be anything."""
+    (text,) = call.args
+    if not isinstance(text, ast.JoinedStr):
+        return "(?s:.*)\n"
+    parts = [re.escape(str(part.value)) if isinstance(part, ast.Constant) else ".*" for part in text.values]
+    return "".join(parts) + "\n"
 
 
 def words(text: str) -> list[str]:

@@ -19,6 +19,7 @@ from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.training.origin.fingerprint import Fingerprint
 from tests.analysis.records.test_report import with_views
 from tests.browser import chromium, errors_in, requests_of, until
+from tests.waiting import PATIENCE
 
 NOTHING = Fingerprint({}, {}, "")
 
@@ -141,7 +142,7 @@ def splats_of(browser: Any, condition: Callable[[np.ndarray], bool]) -> np.ndarr
         done = len(image.getcolors(2**24) or []) > 2000 and np.array_equal(last, before) and condition(before)
         return [before] if done else []
 
-    return WebDriverWait(browser, 60, 0.5).until(drawn)[0]
+    return WebDriverWait(browser, PATIENCE, 0.5).until(drawn)[0]
 
 
 def apart(one: np.ndarray, other: np.ndarray) -> float:

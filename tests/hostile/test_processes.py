@@ -19,6 +19,7 @@ from splat.model.untrusted import beside, locked
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
+from tests.waiting import PATIENCE, waits_for
 
 ROOT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "analysis.commands.cli"]
@@ -45,13 +46,6 @@ def started(words: list[str], **settings) -> subprocess.Popen[str]:
     )
 
 
-def waits_for(process: subprocess.Popen[str], ready: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 300
-    while not ready():
-        assert process.poll() is None and time.monotonic() < deadline, process.communicate(timeout=300)
-        time.sleep(0.01)
-
-
 def hidden(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir() if path.name.startswith(".")]
 
@@ -60,10 +54,10 @@ def hidden(folder: Path) -> list[str]:
 def test_a_training_that_a_signal_ends_saves_and_says_how_to_continue(scene, tmp_path, kind):
     out = tmp_path / "x[v2]"
     process = started(["train", str(scene), "--out", str(out), *LONG])
-    waits_for(process, (out / "checkpoint.pt").exists)
+    waits_for((out / "checkpoint.pt").exists, process)
     time.sleep(1)
     process.send_signal(kind)
-    said = process.communicate(timeout=300)[1]
+    said = process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == 128 + kind, said
     assert f"'{out}'" in said and "Aborted at" not in said and "Traceback" not in said
     assert load_checkpoint(out / "checkpoint.pt").training.step > 0 and hidden(tmp_path) == hidden(out) == []
@@ -74,14 +68,14 @@ def test_what_a_signal_ends_keeps_what_it_found_and_goes_on_from_there(run, tmp_
     out = tmp_path / "record"
     command = [words[0], str(run / "checkpoint.pt"), "--out", str(out), *words[1:]]
     process = started(command)
-    waits_for(process, lambda: any((tmp_path / ".record.unfinished").glob("[!.]*.[mn]*")))
+    waits_for(lambda: any((tmp_path / ".record.unfinished").glob("[!.]*.[mn]*")), process)
     process.terminate()
-    said = process.communicate(timeout=300)[1]
+    said = process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == 143 and said.endswith("landscape: interrupted by SIGTERM\n"), said
     assert "Aborted at" not in said and "Traceback" not in said and shlex.join(command) in said
     assert [path.name for path in tmp_path.iterdir()] == [".record.unfinished"]
     again = started(command)
-    said = again.communicate(timeout=300)[1]
+    said = again.communicate(timeout=PATIENCE)[1]
     assert again.returncode == 0 and (words[0] == "slice" or "kept from before" in said), said
     assert [path.name for path in tmp_path.iterdir()] == ["record"]
 
@@ -89,9 +83,9 @@ def test_what_a_signal_ends_keeps_what_it_found_and_goes_on_from_there(run, tmp_
 def test_a_probe_that_a_signal_ends_as_it_begins_leaves_nothing(run, tmp_path):
     out = tmp_path / "probe"
     process = started(["probe", str(run / "checkpoint.pt"), "--out", str(out)])
-    waits_for(process, beside(out).exists)
+    waits_for(beside(out).exists, process)
     process.terminate()
-    said = process.communicate(timeout=300)[1]
+    said = process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == 143 and said.endswith("landscape: interrupted by SIGTERM\n"), said
     assert "Aborted at" not in said and list(tmp_path.iterdir()) == []
 
@@ -124,7 +118,7 @@ def test_pictures_are_written_whichever_library_was_imported_first():
         "Image.new('RGB', (50, 50)).save(file, 'png')\nimage = Image.open(file)\nimage.load()\n"
         "print(image.size, len(zlib.decompress(zlib.compress(bytes(10**6)))))"
     )
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=100)
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert (done.stdout, done.stderr) == ("(50, 50) 1000000\n", "")
 
 
@@ -140,7 +134,7 @@ def test_signals_that_are_ignored_stay_so():
 def test_a_second_command_on_a_folder_is_refused_and_a_killed_one_holds_nothing(tmp_path):
     path = beside(tmp_path / "run")
     program = "import sys, time\nfrom pathlib import Path\nfrom splat.model.untrusted import locked\n"
-    program += "with locked(Path(sys.argv[1]), 'no other'):\n    print('held', flush=True)\n    time.sleep(100)"
+    program += f"with locked(Path(sys.argv[1]), 'no other'):\n    print('held', flush=True)\n    time.sleep({PATIENCE})"
     with subprocess.Popen([sys.executable, "-c", program, str(path)], cwd=ROOT, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None and other.stdout.readline() == b"held\n"
         with (
@@ -158,12 +152,12 @@ def test_a_second_command_on_a_folder_is_refused_and_a_killed_one_holds_nothing(
 def test_of_two_trainings_in_one_folder_one_is_refused_in_a_sentence(scene, tmp_path):
     out = tmp_path / "run"
     first = started(["train", str(scene), "--out", str(out), *LONG])
-    waits_for(first, (out / "checkpoint.pt").exists)
+    waits_for((out / "checkpoint.pt").exists, first)
     second = started(["train", str(scene), "--out", str(out), *LONG, "--resume"])
-    said = second.communicate(timeout=300)[1]
+    said = second.communicate(timeout=PATIENCE)[1]
     assert second.returncode == 2 and "no other training" in said and said.count("landscape:") == 1
     first.terminate()
-    first.communicate(timeout=300)
+    first.communicate(timeout=PATIENCE)
     assert first.returncode == 143 and load_checkpoint(out / "checkpoint.pt").training.step > 0
 
 
@@ -184,12 +178,12 @@ def limited(size: int) -> Callable[[], None]:
 
 def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_path):
     done = started(["train", str(scene), "--out", str(tmp_path / "new")], preexec_fn=limited(4096))
-    said = done.communicate(timeout=300)[1]
+    said = done.communicate(timeout=PATIENCE)[1]
     assert done.returncode == 74 and str(tmp_path) in said and "Traceback" not in said, said
     quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
     assert main([*quick, str(run / "first")]) == 0  # compiles what is not yet
     done = started([*quick, str(tmp_path / "probe")], preexec_fn=limited(8192))
-    said = done.communicate(timeout=300)[1]
+    said = done.communicate(timeout=PATIENCE)[1]
     assert done.returncode == 74 and str(tmp_path / ".probe.unfinished/") in said and "Traceback" not in said, said
     assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]  # from where it goes on
 
@@ -197,7 +191,7 @@ def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_pa
 def test_a_command_with_too_few_addresses_says_so_before_it_begins(tmp_path):
     few = 2**30
     done = started(["probe", str(tmp_path)], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (few, few)))
-    said = done.communicate(timeout=300)[1]
+    said = done.communicate(timeout=PATIENCE)[1]
     assert done.returncode == 71 and said.startswith("landscape: expected at least 2,147 MB of addresses"), said
 
 
@@ -229,14 +223,14 @@ def test_two_compile_a_kernel_at_once_and_a_cut_file_is_compiled_anew(tmp_path):
         pipe = subprocess.PIPE
         return subprocess.Popen(words, cwd=ROOT, env=environment, stdout=pipe, stderr=pipe, text=True, **settings)
 
-    said = begun(preexec_fn=limited(100)).communicate(timeout=300)[1]
+    said = begun(preexec_fn=limited(100)).communicate(timeout=PATIENCE)[1]
     assert "File too large" in said and str(tmp_path / "cache") in said.splitlines()[-1]
     cold = [begun(), begun()]
-    assert [process.communicate(timeout=300) for process in cold] == [("8.0\n", "")] * 2
+    assert [process.communicate(timeout=PATIENCE) for process in cold] == [("8.0\n", "")] * 2
     for suffix in ("nbi", "nbc"):
         for file in (tmp_path / "cache").rglob(f"small.twice-*.{suffix}"):
             file.write_bytes(file.read_bytes()[:40])
-        assert begun().communicate(timeout=300) == ("8.0\n", "")
+        assert begun().communicate(timeout=PATIENCE) == ("8.0\n", "")
 
 
 @pytest.mark.parametrize("words", [["train", "--help"], ["train", "nowhere"]])

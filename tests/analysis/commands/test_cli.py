@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,6 +38,7 @@ from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
 from splat.training.methods.methods import METHODS
 from splat.training.methods.stablegs.stablegs import StableGS
+from tests.waiting import PATIENCE, waits_for
 
 ROOT = Path(__file__).parents[3]
 SETTINGS = SyntheticSettings(gaussians=60, views=5, width=24, height=18)
@@ -149,12 +149,10 @@ def test_a_run_killed_at_any_moment_and_resumed_is_the_run_that_was_not(original
     out, whole = tmp_path / "killed", tmp_path / "whole"
     command = [sys.executable, "-m", "analysis.commands.cli", *arguments(original, out, *longer)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 100
-    while not (out / "checkpoint.pt").exists() or load_checkpoint(out / "checkpoint.pt").training.step < 3:
-        assert process.poll() is None and time.monotonic() < deadline, process.communicate(timeout=300)[1]
-        time.sleep(0.002)
+    saved = out / "checkpoint.pt"
+    waits_for(lambda: saved.exists() and load_checkpoint(saved).training.step >= 3, process)
     process.kill()
-    process.communicate(timeout=300)
+    process.communicate(timeout=PATIENCE)
     assert process.returncode == -signal.SIGKILL
     assert 3 <= load_checkpoint(out / "checkpoint.pt").training.step < 60
     assert main(arguments(original, out, *longer, "--resume")) == main(arguments(original, whole, *longer)) == 0
@@ -354,7 +352,7 @@ def test_a_process_prints_everything_and_ends_with_its_exit_code():
     program = "from analysis.commands import cli\ncli.main = lambda: print('the last words') or 3\ncli.command()"
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     result = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, env=buffered, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", program], cwd=ROOT, env=buffered, capture_output=True, text=True, timeout=PATIENCE
     )
     assert (result.returncode, result.stdout) == (3, "the last words\n"), result.stderr
 
@@ -368,7 +366,7 @@ def test_the_threads_of_torch_sleep_unless_the_user_says_otherwise(policy, expec
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     environment |= {"OMP_WAIT_POLICY": policy} if policy else {}
     result = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE
     )
     assert result.stdout == f"{expected} False\n", result.stderr
 
@@ -378,7 +376,7 @@ def test_help_needs_no_torch():
         "import sys, analysis.commands.cli\n"
         "try: analysis.commands.cli.main(['train', '--help'])\nfinally: print('torch' in sys.modules)"
     )
-    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert result.returncode == 0 and result.stdout.splitlines()[-1] == "False", result.stderr
 
 

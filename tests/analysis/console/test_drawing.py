@@ -10,9 +10,10 @@ from analysis.console.drawing import ROOT, draw, drawing, own_pool
 from figures.make_all import FIGURES
 from tests.recorded import synthetic, written
 
-STUCK = """
+STUCK = f"""
 import subprocess, sys
-subprocess.run([sys.executable, "-c", "import time; print('asleep', file=open('asleep', 'w')); time.sleep(20)"])
+from tests.waiting import PATIENCE, waits_for
+subprocess.run([sys.executable, "-c", "import time; print('asleep', file=open('asleep', 'w')); time.sleep({PATIENCE})"])
 """
 
 
@@ -27,12 +28,10 @@ def figures(tmp_path, monkeypatch):
 
 def test_an_interruption_ends_the_drawing_and_its_processes(figures):
     (figures / "stuck.py").write_text(STUCK)
-    deadline = monotonic() + 15
     with drawing("stuck"):
-        while not (figures.parent / "asleep").exists():
-            assert monotonic() < deadline
+        waits_for((figures.parent / "asleep").exists)
         start = monotonic()
-    assert monotonic() - start < 10
+    assert monotonic() - start < PATIENCE / 2
 
 
 def test_drawing_says_the_same_now_and_later(figures):

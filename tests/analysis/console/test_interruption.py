@@ -16,13 +16,14 @@ from llvmlite.binding import ffi
 
 from analysis.console.failures import program
 from analysis.console.interruption import AGAIN, SIGNALS, Interrupted, raising
+from tests.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[3]
 
 
 def waits_after(signalled: Callable[[], object]) -> None:
     signalled()
-    end = time.monotonic() + 10
+    end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         time.sleep(0.01)
 
@@ -99,7 +100,7 @@ def test_a_signal_while_the_last_library_is_loaded_is_heard_at_the_end(tmp_path,
 @pytest.mark.parametrize("began", ["landscape", "-m"])
 def test_a_signal_while_a_program_loads_libraries_ends_it_in_a_line(began):
     program = f"import sys; sys.argv[0] = {began!r}\nimport analysis, os, signal, time\n"
-    program += "os.kill(os.getpid(), signal.SIGINT)\ntime.sleep(10)"
+    program += f"os.kill(os.getpid(), signal.SIGINT)\ntime.sleep({PATIENCE})"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "landscape: interrupted by SIGINT\n")
 
@@ -107,7 +108,7 @@ def test_a_signal_while_a_program_loads_libraries_ends_it_in_a_line(began):
 def test_a_script_of_figures_answers_a_signal_as_commands_do():
     def interrupted() -> int:
         os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(10)
+        time.sleep(PATIENCE)
         return 0
 
     handlers = {each: signal.getsignal(each) for each in SIGNALS}

@@ -4,7 +4,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from analysis.records.records import read_record
 from splat.scenes.synthetic import synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from tests.analysis.probe.probed import SCENE
+from tests.waiting import waits_for
 
 ROOT = Path(__file__).parents[3]
 
@@ -80,10 +80,7 @@ def test_a_probe_that_is_killed_leaves_the_old_record_whole(run, record, tmp_pat
     process = subprocess.Popen(
         [sys.executable, "-m", "analysis.commands.cli", *command], cwd=ROOT, stderr=subprocess.DEVNULL
     )
-    deadline = time.monotonic() + 100
-    while not list(tmp_path.glob(".kept.partial-*/probe.json")):  # it is writing the new one
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.002)
+    waits_for(lambda: list(tmp_path.glob(".kept.partial-*/probe.json")), process)  # it is writing the new one
     process.kill()
     assert process.wait() == -signal.SIGKILL
     assert (out / "probe.json").read_bytes() == before and read_record(out).data.provenance.dtype == "float64"

@@ -6,6 +6,7 @@ import torch
 
 from landscape.slices.refinement import SliceSettings
 from landscape.slices.slices import evaluate_slice, symmetric_axis
+from tests.waiting import PATIENCE
 
 CENTER = torch.linspace(-1, 1, 6, dtype=torch.float64)
 SPANS = torch.linalg.qr(torch.randn(6, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))[0]
@@ -142,7 +143,7 @@ def test_a_damaged_file_is_refused(tmp_path):
 
 
 def test_workers_evaluate_at_the_same_time():
-    barrier = threading.Barrier(3, timeout=20)
+    barrier = threading.Barrier(3, timeout=PATIENCE)
     first = threading.Event()
 
     def together(theta):

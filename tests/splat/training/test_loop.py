@@ -230,6 +230,7 @@ from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tin
 from splat.training.checkpoint import save_checkpoint
 from splat.training.loop import train
 from splat.training.state import Training
+from tests.waiting import PATIENCE
 training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
 for done in train(training, tiny_views()):
     if done.step % 4 == 0:
@@ -242,7 +243,7 @@ for done in train(training, tiny_views()):
 def test_a_training_killed_and_resumed_ends_with_the_same_bytes(tmp_path):
     path = tmp_path / "checkpoint.pt"
     command = [sys.executable, "-c", KILLED, str(path)]
-    result = subprocess.run(command, cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=120)
+    result = subprocess.run(command, cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=PATIENCE)
     assert result.returncode == -signal.SIGKILL, result.stderr
 
     loaded = load_checkpoint(path)

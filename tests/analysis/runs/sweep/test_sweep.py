@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +33,7 @@ from splat.training.checkpoint import load_checkpoint
 from splat.training.origin.fingerprint import FORMULAS
 from tests import recorded
 from tests.recorded import synthetic
+from tests.waiting import PATIENCE, waits_for
 
 ROOT = Path(__file__).parents[4]
 FILE = """
@@ -78,9 +78,7 @@ def when(condition, act) -> threading.Thread:
     """Act as soon as the condition holds."""
 
     def watch() -> None:
-        deadline = time.monotonic() + 120
-        while not condition() and time.monotonic() < deadline:
-            time.sleep(0.005)
+        waits_for(condition)
         act()
 
     thread = threading.Thread(target=watch)
@@ -297,15 +295,13 @@ def test_two_sweeps_share_the_cells_and_the_last_writes_all(folder, tmp_path, mo
     cell, run = read_sweep(folder / "changed.toml", tmp_path).cells[0], _Cells.run
 
     def waits(cells: _Cells) -> None:
-        deadline = time.monotonic() + 120
-        while not ((cell.out / "metrics.json").exists() and not lock_of(cell).exists()) and time.monotonic() < deadline:
-            time.sleep(0.005)
+        waits_for(lambda: (cell.out / "metrics.json").exists() and not lock_of(cell).exists())
         run(cells)
 
     monkeypatch.setattr(_Cells, "run", waits)
     command = [sys.executable, "-m", "analysis.commands.cli", *words]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as first:
-        codes = {main(words), first.wait(timeout=300)}
+        codes = {main(words), first.wait(timeout=PATIENCE)}
     assert codes <= {0, CELLS_ELSEWHERE} and 0 in codes
     rows = pd.read_csv(tmp_path / "results.csv")
     assert list(rows["status"]) == ["done"] * 4 and list(rows["psnr"].notna()) == [True] * 4
