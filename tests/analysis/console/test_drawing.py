@@ -9,10 +9,10 @@ import pytest
 from analysis.console.drawing import ROOT, draw, drawing, own_pool
 from figures.make_all import FIGURES
 from tests.recorded import synthetic, written
+from tests.waiting import PATIENCE, waits_for
 
 STUCK = f"""
 import subprocess, sys
-from tests.waiting import PATIENCE, waits_for
 subprocess.run([sys.executable, "-c", "import time; print('asleep', file=open('asleep', 'w')); time.sleep({PATIENCE})"])
 """
 

@@ -27,6 +27,7 @@ from splat.training.loop import prepare, train, with_background
 from splat.training.score.evaluate import evaluate
 from splat.training.state import LearningRates, TrainConfig, Training, learning_rates, position_rate
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
+from tests.waiting import PATIENCE
 
 ONLY_ADAM = DensifySettings(enabled=False)
 
@@ -230,7 +231,6 @@ from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tin
 from splat.training.checkpoint import save_checkpoint
 from splat.training.loop import train
 from splat.training.state import Training
-from tests.waiting import PATIENCE
 training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
 for done in train(training, tiny_views()):
     if done.step % 4 == 0:
