@@ -6,7 +6,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from tests.waiting import PATIENCE, waits_for
 
 ROOT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "analysis.commands.cli"]
-LONG = ["--iterations", "100000", "--checkpoint-every", "1000000"]
+LONG = ["--iterations", "100000", "--checkpoint-every", "1000000", "--log-every", "1"]
 
 
 @pytest.fixture(scope="session")
@@ -46,6 +45,11 @@ def started(words: list[str], **settings) -> subprocess.Popen[str]:
     )
 
 
+def stepped(run: Path) -> bool:
+    """Whether a training has made a step: below the names and the row of its start."""
+    return (run / "train.csv").exists() and (run / "train.csv").read_text().count("\n") > 2
+
+
 def hidden(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir() if path.name.startswith(".")]
 
@@ -54,8 +58,7 @@ def hidden(folder: Path) -> list[str]:
 def test_a_training_that_a_signal_ends_saves_and_says_how_to_continue(scene, tmp_path, kind):
     out = tmp_path / "x[v2]"
     process = started(["train", str(scene), "--out", str(out), *LONG])
-    waits_for((out / "checkpoint.pt").exists, process)
-    time.sleep(1)
+    waits_for(lambda: stepped(out), process)
     process.send_signal(kind)
     said = process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == 128 + kind, said
@@ -152,7 +155,7 @@ def test_a_second_command_on_a_folder_is_refused_and_a_killed_one_holds_nothing(
 def test_of_two_trainings_in_one_folder_one_is_refused_in_a_sentence(scene, tmp_path):
     out = tmp_path / "run"
     first = started(["train", str(scene), "--out", str(out), *LONG])
-    waits_for((out / "checkpoint.pt").exists, first)
+    waits_for(lambda: stepped(out), first)
     second = started(["train", str(scene), "--out", str(out), *LONG, "--resume"])
     said = second.communicate(timeout=PATIENCE)[1]
     assert second.returncode == 2 and "no other training" in said and said.count("landscape:") == 1
