@@ -28,7 +28,8 @@ FORMULAS = 1
 SAME = 1e-9  # of the cameras' distances: what round-off of double precision may move, on another machine
 SHOWN = 3  # views that a sentence names
 Vector = tuple[float, float, float]
-Positive, Length = Annotated[float, Meta(gt=0)], Annotated[int, Meta(ge=1)]
+Positive = Annotated[float, Meta(gt=0)]
+Length = Annotated[int, Meta(ge=1)]
 KINDS = {"photograph": "photograph", "mask": "mask", "depth": "depth map"}
 
 
@@ -170,7 +171,7 @@ def state_of(gaussians: "Gaussians", step: int) -> str:
     for tensor in (gaussians.flat, gaussians.filter_widths):
         if tensor is not None:
             found.update(f" {tensor.dtype} {tensor.numel()} ".encode())
-            found.update(tensor.detach().cpu().contiguous().numpy())
+            found.update(tensor.detach().cpu().contiguous().numpy().data)
     return found.hexdigest()
 
 
