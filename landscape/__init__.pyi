@@ -46,7 +46,6 @@ from .spectrum.anisotropy import Anisotropy as Anisotropy
 from .spectrum.anisotropy import anisotropy as anisotropy
 from .spectrum.anisotropy import effective_rank as effective_rank
 from .spectrum.anisotropy import literal as literal
-from .spectrum.anisotropy import mass_quantile as mass_quantile
 from .spectrum.anisotropy import saddle as saddle
 from .spectrum.anisotropy import share as share
 from .spectrum.density import ActiveSpace as ActiveSpace
@@ -56,8 +55,6 @@ from .spectrum.families import FamilySettings as FamilySettings
 from .spectrum.families import Lead as Lead
 from .spectrum.families import families as families
 from .spectrum.families import family as family
-from .spectrum.quantiles import absolute_quantile as absolute_quantile
-from .spectrum.quantiles import quantile as quantile
 from .spectrum.rules import SpectralDensity as SpectralDensity
 from .traces.diagonal import DiagonalEstimate as DiagonalEstimate
 from .traces.diagonal import GroupSums as GroupSums

@@ -6,7 +6,7 @@
                         is cheaper
     eigenvalues         the two largest and the smallest, from the start vectors of `splat.curvature.block_eigenvectors`
     slice               the loss over the plane of the first two eigenvectors: rendered where needed, interpolated elsewhere
-    density *           stochastic Lanczos quadrature, for sums and quantiles of |lambda|; the Krylov spaces of its first runs
+    density *           stochastic Lanczos quadrature, for sums of |lambda|; the Krylov spaces of its first runs
                         contain the iterates of the paper's power iteration
     power iteration     with separate products, only with --power
     finite probe *      the second difference of the loss along the first eigenvector, over a range of steps

@@ -39,7 +39,7 @@ class ProbeOptions:
     """Power iteration (the paper's way to the ends) with 40 products of its own for each end.
     Else it is read from the density's Lanczos runs, up to as many steps as they have, without a product."""
     density_products: Unset[int] = None
-    """Products of the spectral density: more make the brackets of sums and quantiles narrower.  Default: 108."""
+    """Products of the spectral density: more make the brackets of sums narrower.  Default: 108."""
     end_products: Unset[int] = None
     """Products of the search for both ends of the spectrum, at most.  Default: 3000."""
     slice_points: Unset[int] = None

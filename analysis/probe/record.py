@@ -22,7 +22,6 @@ from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, literal
 from landscape.results import Bracket, finite_or_none, sampling_error
 from landscape.slices.slice import Slice as Grid
-from landscape.spectrum.quantiles import quantile
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import ActiveCounts, SceneObjective
 from splat.curvature.scores.shares import BlockShare
@@ -33,14 +32,13 @@ from splat.training.checkpoint import Checkpoint
 from splat.training.origin.fingerprint import Fingerprint
 
 NAMES = ("e₁", "e₂")  # of the slice's directions
-QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
 def probe_record(
     found: Measured, objective: SceneObjective, made: Provenance, timing: Mapping[str, float]
 ) -> ProbeRecord:
     """The record without the families.  timing: seconds of the stages so far."""
-    density, left_out = found.density, found.left_out
+    left_out = found.left_out
     # the others' blocks have full rank: mean 3, log-scales 3, quaternion 3, logit 1
     seen = {"sh": found.rank - 10 * objective.counts.active_gaussians}
     of_loss = UNSET if left_out is None else sampling_error(left_out.losses, left_out.population)
@@ -49,9 +47,6 @@ def probe_record(
         traces={name: _trace(trace, left_out, seen.get(name)) for name, trace in found.traces.items()},
         eigenvalues=_eigenvalues(found, objective),
         anisotropy=_anisotropy(found),
-        quantiles=None
-        if density is None
-        else {f"{share:g}": index_of(quantile(density, share)) for share in QUANTILES},
         finite_probe=None
         if found.finite is None
         else convert({**found.finite.record(), "direction": NAMES[0]}, schema.FiniteProbe),

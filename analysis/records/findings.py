@@ -230,7 +230,7 @@ def remedy(data: ProbeRecord, name: str) -> str:
     if "matvec budget" in reasons:
         spent = ends.min.matvecs or 1
         return f"more products resolve it: {_with(command, '--end-products', 4 * spent)}"
-    if name in ("share", "effective_rank", "mass_quantile"):
+    if name in ("share", "effective_rank"):
         products = int((made.fingerprint.question if made.fingerprint else {}).get("settings.density_matvecs") or 108)
         return f"a longer density narrows it: {_with(command, '--density-products', 4 * products)}"
     return "the end is within its error of 0, and no more products resolve it"

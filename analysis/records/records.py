@@ -122,7 +122,6 @@ class ProbeRecord(Struct, kw_only=True):
     traces: dict[str, schema.Trace]
     eigenvalues: schema.Eigenvalues
     anisotropy: schema.Anisotropy
-    quantiles: dict[str, schema.Index] | None = None
     finite_probe: schema.FiniteProbe | None = None
     depth: schema.Depth | None = None
     block_shares: Maybe[list[schema.BlockShare]] = UNSET
@@ -252,10 +251,9 @@ def read_record(folder: str | Path, kind: type[Data] | None = None) -> Record[Da
             pass
         case _:
             raise InputError(f'expected {what} in {path}, got JSON without "format": {plain(found.FORMAT)}; {again}')
-    if version > found.FORMAT.version:
+    if version != found.FORMAT.version:
         raise InputError(
-            f"expected a record of format version {found.FORMAT.version} or older in {path}, got version {version}; "
-            f"update splat-landscape, or {again}"
+            f"expected a record of format version {found.FORMAT.version} in {path}, got version {version}; {again}"
         )
     data = fitted(raw, found, str(path), again)
     arrays = {group: _read_arrays(folder, group, data.arrays[group], again) for group in ARRAYS if group in data.arrays}

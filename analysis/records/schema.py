@@ -7,8 +7,7 @@ null (None)   not determined; the `note` beside it says why
 UNSET         the key is absent: not every file has it.  UNSET is false, as None is
 not finite    a float; in the file, which is strict JSON, the text "NaN", "Infinity" or "-Infinity"
 
-Within a version of a format, keys are added, never renamed or removed.  Fields with a default may be absent from older files;
-keys of a file that are not fields are ignored.
+Keys of a file that are not fields are ignored; a file of another version of its format is refused.
 """
 
 import math
@@ -23,7 +22,7 @@ Number = float | None
 Count = Annotated[int, Meta(ge=0)]
 Sign = Literal["positive", "negative", "zero", "undetermined"]
 Operator = Literal["hessian", "gauss-newton"]
-IndexName = Literal["literal", "saddle", "share", "effective_rank", "mass_quantile"]
+IndexName = Literal["literal", "saddle", "share", "effective_rank"]
 
 
 def _require_error(name: str, value: Number) -> None:
@@ -193,7 +192,6 @@ class Anisotropy(Named[Index], kw_only=True):
     saddle: Maybe[Index] = UNSET
     share: Maybe[Index] = UNSET
     effective_rank: Maybe[Index] = UNSET
-    mass_quantile: Maybe[Index] = UNSET
 
 
 INDICES = Anisotropy.__struct_fields__
@@ -388,5 +386,5 @@ class Slice(Struct, kw_only=True):
 
     @property
     def is_resolved(self) -> bool:
-        """Whether every point of the grid has a loss, as in older files, which lack the key."""
+        """Whether every point of the grid has a loss."""
         return self.resolved is not False

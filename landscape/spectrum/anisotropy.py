@@ -4,8 +4,6 @@
     saddle          lambda_1 / |lambda_n|                          of an indefinite operator only
     share           lambda_1 / sum |lambda_i|                      how much of all curvature is in one direction
     effective_rank  (sum |lambda_i|)^2 / sum lambda_i^2            over how many directions it is spread, 1 to n
-    mass_quantile   lambda_1 / t, t the magnitude that the share   how far the steepest direction stands above those that
-                    p = 0.05 of sum |lambda_i| lies at or below    hardly add to all curvature; null directions do not count
 
 Brackets follow from the eigenvalues' residuals, how far out an end that has not converged may lie, the round-off and the sums'
 intervals (each at a level that gives the quotient 95%).  The literal index is negative for an indefinite operator; where
@@ -26,7 +24,6 @@ from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.results import Bracket, Brief
 from landscape.spectrum.absolute_sum import absolute_sum
-from landscape.spectrum.quantiles import absolute_quantile
 from landscape.spectrum.rules import SpectralDensity
 
 
@@ -40,7 +37,6 @@ class Anisotropy(Brief):
     saddle: Bracket
     share: Bracket | None = None
     effective_rank: Bracket | None = None
-    mass_quantile: Bracket | None = None
 
     def record(self) -> dict[str, object]:
         members = {
@@ -48,7 +44,6 @@ class Anisotropy(Brief):
             "saddle": self.saddle,
             "share": self.share,
             "effective_rank": self.effective_rank,
-            "mass_quantile": self.mass_quantile,
         }
         return {name: bracket.record() for name, bracket in members.items() if bracket is not None}
 
@@ -65,7 +60,6 @@ def anisotropy(ends: EigenEnds, density: SpectralDensity | None = None) -> Aniso
         saddle=saddle(ends),
         share=None if density is None else share(ends, density),
         effective_rank=None if density is None else effective_rank(ends, density),
-        mass_quantile=None if density is None else mass_quantile(ends, density),
     )
 
 
@@ -128,14 +122,6 @@ def effective_rank(ends: EigenEnds, density: SpectralDensity) -> Bracket:
     high = most**2 / square if square else inf
     value = min(max(middle**2 / max(squares.value or 0.0, floor), 1.0), float(density.dim))
     return Bracket(value, max(low, 1.0), min(high, float(density.dim)), total.note)
-
-
-def mass_quantile(ends: EigenEnds, density: SpectralDensity, p: float = 0.05) -> Bracket:
-    """lambda_max / t, t the magnitude at or below which the share p of sum |lambda| lies (`absolute_quantile`)."""
-    top, small = _intervals(ends)[0], absolute_quantile(density, p, JOINT)
-    if not small.value:
-        return Bracket(None, inf, inf, small.note)
-    return Bracket(float(ends.largest.values[0]) / small.value, *_quotients(top, (small.low, small.high)), small.note)
 
 
 def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -51,7 +51,7 @@ UNEVEN = 0.1  # spread of the squares of a start vector's entries about 1
 SETTLED = 1e-4  # largest error of an eigenvector found by the runs
 FOUND, CLOSE = 1e-2, 0.1  # largest error of an eigenvector found before, and its residual over the eigenvalue
 SAME = 1e-6  # largest 1 - cos^2 between equal eigenvectors
-# by default: Student's interval of three is half as long again (`quantiles`), and kernels favour blocks of four
+# by default: Student's interval of three is half as long again, and kernels favour blocks of four
 FEWEST_STARTS = 4
 FIRST_LOOK, GROWTH = 12, 4 / 3  # steps
 CONFIDENCE = 0.95  # of the interval that is to be short
@@ -223,9 +223,8 @@ class _Runs:
             self.rules.append((values[left], mass / mass.sum(), norm(run.r) == 0))
 
     def density(self, trace: tuple[float, float] | None) -> SpectralDensity:
-        """The density of all rules, in one table: shorter ones are filled up with nodes of weight 0, by which `quantiles` needs
-        at least m + 1 after m nodes that are the measure itself."""
-        longest = max((1 + whole) * len(nodes) + whole for nodes, _, whole in self.rules)
+        """The density of all rules, in one table: shorter ones, and those that are the measure itself, end in weights of 0."""
+        longest = max(len(nodes) + whole for nodes, _, whole in self.rules)
         nodes = torch.zeros(len(self.rules), longest, dtype=torch.float64)
         weights = torch.zeros_like(nodes)
         for i, (at, mass, _) in enumerate(self.rules):

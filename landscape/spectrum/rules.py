@@ -145,13 +145,6 @@ class SpectralDensity:
         rounding = EPS * self.dim * float(torch.cat([terms, function(self.nodes[self.weights > 0]).abs()]).max())
         return rounding + (0.0 if self.missed is None else float((self.missed * terms).sum()))
 
-    @property
-    def residuals(self) -> Float64[Tensor, " k"]:
-        """Residuals of the known eigenvalues: within its residual of each lies an eigenvalue of H."""
-        if self.missed is None:
-            return torch.zeros_like(self.known)
-        return self.known.abs() * torch.maximum(self.missed / 4, self.missed.sqrt() / 2)
-
     def by_trace(
         self, function: Callable[[Tensor], Tensor], confidence: float
     ) -> tuple[Float64[Tensor, " starts"], float]:

@@ -28,7 +28,6 @@ from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 
-SHARE = 0.05  # of the sum of |lambda|, for the mass quantile
 ROWS = 200  # of a random matrix
 WIDTHS = (1, 2, 4, 8)  # vectors at a time whose product is timed
 SETTINGS = SyntheticSettings(60, 2, 24, 18, sh_degree=0)
@@ -44,7 +43,6 @@ class Truth:
     smallest: float
     absolute_sum: float
     effective_rank: float
-    mass_quantile: float
     diagonal: Float64[Tensor, " n"] | None
 
     @classmethod
@@ -59,20 +57,8 @@ class Truth:
             smallest=float(values[0]),
             absolute_sum=total,
             effective_rank=total**2 / float(values.square().sum()),
-            mass_quantile=float(values[-1]) / weighted_quantile(values.abs(), values.abs()),
             diagonal=diagonal.clone(),
         )
-
-
-def weighted_quantile(magnitudes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"]) -> float:
-    """The magnitude at or below which SHARE of the weight lies.
-
-    >>> weighted_quantile(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([90.0, 4.0, 6.0]))
-    2.0
-    """
-    ordered, order = magnitudes.sort()
-    sums = weights[order].cumsum(0)
-    return float(ordered[int(torch.searchsorted(sums, SHARE * sums[-1]).clamp_max(len(sums) - 1))])
 
 
 @dataclass(frozen=True, eq=False)

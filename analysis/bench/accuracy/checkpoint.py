@@ -20,7 +20,7 @@ from analysis.bench.accuracy.cases import Case, Truth
 from analysis.bench.workloads import workload_of
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.spectrum.absolute_sum import absolute_sum
-from landscape.spectrum.anisotropy import effective_rank, mass_quantile
+from landscape.spectrum.anisotropy import effective_rank
 from landscape.spectrum.density import ActiveSpace, spectral_density
 from landscape.traces.trace import TraceSettings, total_trace
 from splat.curvature.hessian import SceneHessian
@@ -65,8 +65,8 @@ def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:
     ends = extreme_eigenpairs(hessian, generator(1), EigenSettings(rtol=FINE, basis=128, max_matvecs=MOST))
     active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)
     density = spectral_density(hessian, generator(2), STARTS * STEPS, STARTS, active=active, ends=ends, trace=trace)
-    rank, quantile = effective_rank(ends, density).value, mass_quantile(ends, density).value
-    assert rank is not None and quantile is not None
+    rank = effective_rank(ends, density).value
+    assert rank is not None
     return Truth(
         traces={name: trace.value for name, trace in traces.items()},
         scales=scales,
@@ -74,6 +74,5 @@ def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:
         smallest=float(ends.smallest.values[0]),
         absolute_sum=absolute_sum(density).value or 0.0,
         effective_rank=rank,
-        mass_quantile=quantile,
         diagonal=None,
     )

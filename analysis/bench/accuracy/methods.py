@@ -4,7 +4,7 @@ A method is run on an operator that counts, with a seed, and returns an `Answer`
 
     traces            one part a block
     ends              "largest" and "smallest"
-    sum of |lambda|, effective rank, mass quantile     one part, from one spectral density ("sums")
+    sum of |lambda|, effective rank                    one part, from one spectral density ("sums")
     diagonal          one part, a vector
 
 Work other than products H v is counted in products: PASS for a pass over the pixels that computes the diagonal block of every
@@ -29,7 +29,7 @@ from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds
 from landscape.eigen.power import PowerSettings, power_ends
 from landscape.spectrum.absolute_sum import absolute_sum
-from landscape.spectrum.anisotropy import effective_rank, mass_quantile
+from landscape.spectrum.anisotropy import effective_rank
 from landscape.spectrum.density import spectral_density
 from landscape.traces.diagonal import Method as DiagonalMethod
 from landscape.traces.diagonal import estimate_diagonal
@@ -212,7 +212,7 @@ def _end_answers(ends: EigenEnds) -> list[Answer]:
 
 
 def density_methods() -> Iterator[Method]:
-    """Sums from one density.  Products for the quantile's lambda_1 (`Case.ends`) do not count, as a probe has both ends."""
+    """Sums from one density.  Products for the ends (`Case.ends`) do not count, as a probe has both ends."""
     yield _density("as it goes", "default")
     for starts, steps in DENSITIES:
         yield _density(f"{starts} x {steps}", "own", matvecs=starts * steps, starts=starts)
@@ -225,11 +225,7 @@ def _density(text: str, origin: Origin, known: bool = False, **division: int) ->
     def run(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         before = {"ends": case.ends, "trace": (sum(case.truth.traces.values()), 0.0)} if known else {}
         density = spectral_density(operator, generator(seed + 1), active=case.active, **division, **before)
-        found = {
-            "sum of |lambda|": absolute_sum(density),
-            "effective rank": effective_rank(case.ends, density),
-            "mass quantile": mass_quantile(case.ends, density),
-        }
+        found = {"sum of |lambda|": absolute_sum(density), "effective rank": effective_rank(case.ends, density)}
         return [
             Answer(part, nan if x.value is None else x.value, (x.high - x.low) / 2, x.low, x.high)
             for part, x in found.items()

@@ -18,7 +18,7 @@ import torch
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, lobpcg
 from torch import Tensor
 
-from analysis.bench.accuracy.cases import Case, MeteredOperator, weighted_quantile
+from analysis.bench.accuracy.cases import Case, MeteredOperator
 from analysis.bench.accuracy.methods import BUDGETS, DENSITIES, Answer, Method, Run
 from landscape.operators.operator import RestrictedOperator, SymmetricOperator
 
@@ -242,11 +242,9 @@ def _eigenthings(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Metho
         kept = found.raw_weights > 0
         values, weights = found.raw_eigenvalues[kept].double(), found.raw_weights[kept].double() / starts
         total, squares = float((weights * values.abs()).sum()), float((weights * values.square()).sum())
-        small = weighted_quantile(values.abs(), weights * values.abs())
         return [
             Answer("sum of |lambda|", operator.dim * total),
             Answer("effective rank", operator.dim * total**2 / squares),
-            Answer("mass quantile", float(values.max()) / small),
         ]
 
     for budget, (method, name) in product(budgets, {"hutchinson": "Hutchinson", "hutch++": "Hutch++"}.items()):

@@ -14,7 +14,7 @@ MATRICES = 1.1  # the same on matrices, for every quantity
 DRAWS = 200  # of the bootstrap
 LIMITS = (0.025, 0.975)  # of a 95% interval
 MEANS = ("error", "needs", "rival_needs", "ratio", "seconds_ratio")  # columns averaged over scenes
-QUANTITIES = ("traces", "ends", "sum of |lambda|", "effective rank", "mass quantile", "diagonal")
+QUANTITIES = ("traces", "ends", "sum of |lambda|", "effective rank", "diagonal")
 SETTING = ["case", "family", "quantity", "origin", "method", "settings"]
 
 

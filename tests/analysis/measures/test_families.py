@@ -226,7 +226,7 @@ def test_a_family_whose_small_end_is_not_resolved_is_given_by_its_bound(record):
     data = copy.deepcopy(record.data)
     indices = data.families[0].indices
     indices.literal = Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")
-    indices.mass_quantile = Index(value=7.0, low=0.0, high=None, note="2 steps")
+    indices.effective_rank = Index(value=7.0, low=0.0, high=None, note="2 steps")
     cells = family_lines(data)[0].indices
     assert cells[0].value == "≥ 34.2" and cells[0].note == "lambda_min is not resolved"
     assert cells[-1].value == "–"  # a bound that says nothing
@@ -258,7 +258,7 @@ def test_at_80_columns_every_number_and_label_is_whole(record):
     wide = Index(value=-1.234e-4, low=-1.235e-4, high=-1.233e-4, note="")
     bracket = Index(value=2.5e-4, low=7.45e-4, high=1.02e4, note="")
     for row in data.families:
-        row.indices.literal, row.indices.share, row.indices.mass_quantile = wide, bracket, bracket
+        row.indices.literal, row.indices.share, row.indices.effective_rank = wide, bracket, bracket
     for effect in data.split_control.effects:
         numbers = wide if effect.index == "literal" else bracket
         effect.value, effect.low, effect.high, effect.note = numbers.value, numbers.low, numbers.high, ""
@@ -268,7 +268,7 @@ def test_at_80_columns_every_number_and_label_is_whole(record):
     lines = console.file.getvalue().splitlines()
     assert max(map(len, lines)) <= 80
     said = soft("\n".join(lines))
-    for whole in ("Gauss-Newton", "colour (SH)", "  changes by", "effective rank", "mass quantile"):
+    for whole in ("Gauss-Newton", "colour (SH)", "  changes by", "effective rank"):
         assert whole in said
     assert said.count("± 0.0010) × 10⁻⁴") == 36 and said.count("7.45 × 10⁻⁴ …") == said.count("1.02 × 10⁴") >= 72
     assert not re.search(r"\S…", said)  # where text was cut off

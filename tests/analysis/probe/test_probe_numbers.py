@@ -156,22 +156,6 @@ def test_positions_are_split_along_and_across_the_rays(record, dense):
     assert all(f"depth / lateral rise, {step:g} px" in table for step in STEPS)
 
 
-def test_quantiles_ascend_and_hold_those_of_the_dense_spectrum(record, dense):
-    _, H, _, _ = dense
-    found, null = record.data.quantiles, len(H) - record.data.counts.rank
-    true = torch.linalg.eigvalsh((H + H.T) / 2)
-    true = true[true.abs().argsort()][null:].sort().values  # the exact null space left out
-    values = [found[share].value for share in found]
-    assert values == sorted(values) and len(values) == 7
-    held = 0
-    for share, entry in found.items():
-        at = float(true[min(int(float(share) * len(true)), len(true) - 1)])
-        low = -math.inf if entry.low is None else entry.low
-        high = math.inf if entry.high is None else entry.high
-        held += low - rounding(H) <= at <= high + rounding(H)
-    assert held == 7
-
-
 def test_the_share_within_gaussians_blocks_is_that_of_the_dense_hessian(record, dense):
     objective, H, _, _ = dense
     found = record.data.block_shares

@@ -437,12 +437,7 @@ def test_needles_are_counted_and_notes_are_sentences():
 @pytest.mark.parametrize(
     ("index", "settings", "reason", "command"),
     [
-        (
-            "mass_quantile",
-            {"density_matvecs": 108},
-            "tolerance",
-            "landscape probe run --out there --density-products 432",
-        ),
+        ("share", {"density_matvecs": 108}, "tolerance", "landscape probe run --out there --density-products 432"),
         ("literal", {}, "time budget", "landscape probe run --out there"),
         ("literal", {}, "matvec budget", "landscape probe run --out there --end-products 60"),
         ("literal", {}, "noise floor", None),
@@ -469,21 +464,21 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
 
 def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution(tmp_path):
     data, arrays = synthetic()
-    data["anisotropy"]["mass_quantile"] = {"value": 361.25, "low": 15.0, "high": 151.0, "note": "4 start vectors"}
-    (line,) = (line for line in findings(probe_of(data)) if line.text.startswith("Mass quantile"))
+    data["anisotropy"]["share"] = {"value": 361.25, "low": 15.0, "high": 151.0, "note": "4 start vectors"}
+    (line,) = (line for line in findings(probe_of(data)) if line.text.startswith("Share"))
     assert line.level == "caution" and "– (between 15.0 and 151)" in line.text
     text = Page(page(tmp_path / "probe", data, arrays)).text
     assert "361" not in text
-    data["anisotropy"]["mass_quantile"]["high"] = 149.0
-    assert not any(line.text.startswith("Mass quantile") for line in findings(probe_of(data)))
+    data["anisotropy"]["share"]["high"] = 149.0
+    assert not any(line.text.startswith("Share") for line in findings(probe_of(data)))
 
 
 def test_names_and_notes_that_look_like_markup_are_printed_as_they_are():
     data, _ = synthetic()
     data["checks"]["[/x]"] = data["checks"].pop("symmetry")
     data["anisotropy"]["literal"]["note"] = "[/note]"
-    old = json.loads((Path(__file__).parent / "old" / "probe.json").read_text())
-    data["families"] = [old["families"][0] | {"unit": "[/unit]", "block": "[/block]"}]
+    example = json.loads((Path(__file__).parent / "examples" / "probe.json").read_text())
+    data["families"] = [example["families"][0] | {"unit": "[/unit]", "block": "[/block]"}]
     console = Console(width=140, file=StringIO())
     record = probe_of(data)
     console.print(probe_table(record, 140), family_table(record))

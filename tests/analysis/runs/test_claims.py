@@ -27,7 +27,7 @@ from splat.training.start import Source
 from splat.training.state import LearningRates, TrainConfig
 from tests.recorded import synthetic, written
 
-LARGER = ("literal", "saddle", "share", "mass_quantile")  # the more anisotropic
+LARGER = ("literal", "saddle", "share")  # the more anisotropic
 STABLE, ALONE = "stablegs", "stablegs vsp_weight=0"
 PAPER = {"literal": 0.26, "psnr": 4.9, "attributes": 2.92, "viewpoints": 2.29, "means": 2.46, "depth": 100.0, "needles": 0.9,
          "ranks": 1e4, "time": 1.25, "lambda": 0.3, "elongation": 0.5, "opacity": 0.6}  # fmt: skip
@@ -49,8 +49,7 @@ def made_up(world: dict, seeds: int = 3, spread: float = 0.02) -> pd.DataFrame:
         for seed in range(seeds):
             stable, noise = method == STABLE, lambda: 1 + spread * rng.standard_normal()
             index = {
-                name: 100 * (world["literal"] if stable else 1) * noise()
-                for name in ("literal", "saddle", "share", "mass_quantile")
+                name: 100 * (world["literal"] if stable else 1) * noise() for name in ("literal", "saddle", "share")
             }
             index["effective_rank"] = 10 / (world["literal"] if stable else 1) * noise()
             top = 50 * (world["lambda"] if stable else 1) * noise()

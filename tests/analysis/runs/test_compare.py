@@ -50,7 +50,7 @@ def record(folder: Path, scale: float, **changes) -> None:
     end = {"value": 4.0, "residual": 0.1, "reason": "tolerance"}
     about = {"operator": "hessian", "block": "means", "metric": "parameters", "unit": "stored units", "split": False}
     index = {"value": 7.0 * scale, "low": 6.0 * scale, "high": 9.0 * scale, "note": ""}
-    names = ("literal", "saddle", "share", "effective_rank", "mass_quantile")
+    names = ("literal", "saddle", "share", "effective_rank")
     family = {"gaussians": 10091, "dim": 30273, "rank": 30000, "lambda_max": end, "lambda_min": end}
     family |= {"indices": dict.fromkeys(names, index)}
     data["families"] = [about | family, about | family | {"split": True, "gaussians": 20000}]

@@ -7,7 +7,7 @@ from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds, Eigenpairs
 from landscape.eigen.power import PowerSettings, power_ends
 from landscape.operators.operator import DenseOperator
-from landscape.spectrum.anisotropy import _quotients, anisotropy, effective_rank, literal, mass_quantile, saddle, share
+from landscape.spectrum.anisotropy import _quotients, anisotropy, effective_rank, literal, saddle, share
 from landscape.spectrum.density import spectral_density
 from tests.landscape.spectra import ROUNDING, N, eigenvalues, generator, operator
 
@@ -133,12 +133,6 @@ def test_every_bracket_holds_the_truth(name):
     assert family.share is not None and family.effective_rank is not None
     assert family.share.low <= float(true[-1] / magnitude) <= family.share.high
     assert family.effective_rank.low <= float(magnitude**2 / true.square().sum()) <= family.effective_rank.high
-    small = float(
-        true.abs().sort().values[int(torch.searchsorted(true.abs().sort().values.cumsum(0), 0.05 * magnitude))]
-    )
-    assert family.mass_quantile is not None
-    quantile = float(true[-1]) / small
-    assert family.mass_quantile.low * (1 - ROUNDING) <= quantile <= family.mass_quantile.high * (1 + ROUNDING)
     if name == "rank-deficient":
         assert family.literal.high == inf and family.literal.low > 1e10 and family.saddle.value is None
         return
@@ -155,15 +149,13 @@ def test_a_multiple_of_the_identity_has_full_effective_rank_and_even_share():
     rank = effective_rank(found, density)
     assert (rank.low, rank.value, rank.high) == pytest.approx((N, N, N))
     assert share(found, density).value == pytest.approx(-1 / N)
-    quotient = mass_quantile(found, density)
-    assert quotient.value == pytest.approx(-1) and quotient.low <= -1 <= quotient.high <= 0
 
 
 def test_the_zero_operator_has_no_index():
     H = operator("zero")
     found, density = extreme_eigenpairs(H, generator()), spectral_density(H, generator())
     family = anisotropy(found, density)
-    for index in (family.literal, family.saddle, family.share, family.effective_rank, family.mass_quantile):
+    for index in (family.literal, family.saddle, family.share, family.effective_rank):
         assert index is not None and index.value is None
 
 
@@ -186,7 +178,7 @@ def test_splitting_a_direction_in_two_halves_changes_the_literal_index_but_not_t
     assert before.share is not None and after.share is not None
     assert after.share.low <= float(twice[-1] / twice.abs().sum()) <= after.share.high
     assert float(twice[-1] / twice.abs().sum()) == pytest.approx(float(true[-1] / true.abs().sum()))
-    assert before.record().keys() == {"literal", "saddle", "share", "effective_rank", "mass_quantile"}
+    assert before.record().keys() == {"literal", "saddle", "share", "effective_rank"}
 
 
 def test_without_a_density_only_the_ends_indices_are_given():

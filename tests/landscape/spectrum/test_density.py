@@ -6,9 +6,10 @@ import torch
 
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.linalg import unit_columns
-from landscape.operators.operator import DenseOperator
+from landscape.operators.operator import DenseOperator, ProjectedOperator
+from landscape.probes import draw_probes
 from landscape.spectrum.absolute_sum import FAR, absolute_integral, absolute_sum, integrals_of_rules
-from landscape.spectrum.density import SETTLED, draw_starts, spectral_density
+from landscape.spectrum.density import SETTLED, ActiveSpace, draw_starts, spectral_density
 from landscape.spectrum.rules import SpectralDensity
 from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
 from tests.oracles import absolute_matrix
@@ -183,7 +184,24 @@ def test_progress_ends_at_starts_times_steps():
     assert seen == sorted(seen) and seen[-1] == (15, 15)
 
 
+def test_a_known_null_space_is_left_out_of_the_sums():
+    rank = 40
+    basis = torch.linalg.qr(draw_probes(N, rank, generator(7), torch.float64)).Q
+    curvatures = torch.linspace(1, 2, rank, dtype=torch.float64)
+    inner = DenseOperator(basis @ torch.diag(curvatures) @ basis.T + torch.eye(N) - basis @ basis.T)
+    H = ProjectedOperator(inner, lambda V: basis @ (basis.T @ V))
+    active, covered, runs = ActiveSpace(H.project, rank), 0, 40
+    for seed in range(runs):
+        density = spectral_density(H, generator(seed), matvecs=48, starts=4, active=active)
+        assert density.dim == rank and float(density.nodes.min()) > 1 - 1e-9  # none of the 80 zeros
+        total = absolute_sum(density)
+        covered += total.low <= 60 <= total.high
+    assert covered / runs >= 0.95 - 4 * np.sqrt(0.95 * 0.05 / runs)
+
+
 def test_bad_settings_are_refused():
+    with pytest.raises(ValueError, match="rank 1 or more"):
+        ActiveSpace(lambda V: V, 0)
     with pytest.raises(ValueError, match="starts >= 2"):
         spectral_density(operator("zero"), generator(), starts=1)
 

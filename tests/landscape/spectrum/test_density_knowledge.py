@@ -11,8 +11,6 @@ from landscape.linalg import norm
 from landscape.operators.operator import DenseOperator, ProjectedOperator
 from landscape.spectrum.absolute_sum import absolute_integral, absolute_sum
 from landscape.spectrum.density import FIRST_LOOK, Lengths, spectral_density, without
-from landscape.spectrum.quantiles import absolute_quantile
-from landscape.spectrum.rules import SpectralDensity
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import total_trace
 from tests.landscape.spectra import N, eigenvalues, generator, operator
@@ -223,15 +221,6 @@ def test_averaged_rules_are_closer_than_gauss_rules_where_the_kink_is_anywhere(s
         averaged.append(value - truth)
         gauss.append(float((weights * (nodes - c).abs()).sum()) - truth)
     assert torch.tensor(averaged).norm() < torch.tensor(gauss).norm() / 2
-
-
-def test_a_quantile_lies_between_nodes_where_they_are_few():
-    """Uniform eigenvalues on [0, 1]: the share p of their sum lies at or below sqrt(p)."""
-    nodes, S = torch.linalg.eigh((legendre(10) + torch.eye(10)) / 2)
-    density = SpectralDensity(nodes.repeat(2, 1), S[0].square().repeat(2, 1), 10**6, 20)
-    for p in (0.05, 0.2, 0.5):
-        spacing = float(torch.diff(nodes)[int((nodes < p**0.5).sum()) - 1])
-        assert absolute_quantile(density, p).value == pytest.approx(p**0.5, abs=spacing / 5)
 
 
 def test_the_trace_of_all_blocks_has_the_errors_of_all():
