@@ -83,7 +83,7 @@ class Scale:
 
 
 def require_same_function(runs: Sequence[Path]) -> None:
-    """InputError where the runs' landscapes are those of different functions; what an older record lacks is not compared."""
+    """InputError where the runs' landscapes are those of different functions; what a record lacks is not compared."""
     records = {run: _record_of(run).data for run in runs}
     for key, what in FUNCTION.items():
         found = {

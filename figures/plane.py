@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
-from msgspec import UNSET
 
 from analysis.records import schema
 from analysis.records.findings import unresolved
@@ -143,7 +142,7 @@ def plane(record: Record) -> Plane:
 def direction(about: schema.Direction, steps: np.ndarray, exponent: int) -> Direction:
     """An axis as it was recorded."""
     curvature, unit = (np.nan if number is None else number for number in (about.curvature, about.unit))
-    scale = Direction.scale if about.scale in (UNSET, "param. units") else about.scale  # as older records call it
+    scale = about.scale or Direction.scale
     return Direction(literal(about.name), curvature, unit, steps, exponent, literal(scale), about.kind or "")
 
 

@@ -13,7 +13,6 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from landscape.errors import InputError, did_you_mean
-from splat.model.settings import current_settings
 from splat.model.typed import leaves
 from splat.training.methods.methods import METHODS
 from splat.training.state import MethodSettings, TrainConfig
@@ -40,13 +39,9 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
 
     >>> overridden(TrainConfig(), {"densify.every": "50"}).densify.every
     50
-    >>> overridden(TrainConfig(), {"render.sums": "ordered"}).render.accumulation  # an older word for it
-    'deterministic'
     """
     own = _settable(TrainConfig)
     for key, value in changes.items():
-        if key == "render.sums":
-            key, value = "render.accumulation", current_settings({"sums": value})["accumulation"]
         path = key.split(".")
         if path[0] not in own + _settable(type(config.method)):
             raise InputError(_unknown(key, config))

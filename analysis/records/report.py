@@ -207,7 +207,7 @@ def numbers(data: ProbeRecord, mapped: MapRecord | None = None) -> list[dict[str
 
 
 def _by_renders(end: Steepest) -> str:
-    """Comparison of an end's curvature with renders of several steps; empty in older maps."""
+    """Comparison of an end's curvature with renders of several steps; empty where there are none."""
     if end.is_refuted:
         return "; not confirmed by renders"
     if not end.factors:

@@ -31,7 +31,7 @@ CHECKPOINT, METRICS, SECONDS, RECORDS, COMPARISON = (
 )  # fmt: skip
 MAP = "map"  # RUN/map, a folder of `landscape map`
 NO_TIME = "no time"  # how the note of a record of a trajectory begins that was skipped for that
-STATES = ("whole", "coarse", "cut", "skipped")  # of a record of a trajectory; older ones were cut where time ended them
+STATES = ("whole", "coarse", "cut", "skipped")  # of a record of a trajectory
 TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
 WHOLE = ("step", "gaussians")  # columns of a trajectory
@@ -138,7 +138,7 @@ class Steepest(Struct, kw_only=True):
     curvature: its eigenvalue.  participation: over how many Gaussians it is spread.  view: in which the first of the carriers
     weighs most; crop: left, top, right, bottom of the part that is shown, px.  step: along the unit vector; losses: at -step,
     0, +step.  steps, factors: of other lengths, the longest first, the mean change of the loss by both, rendered, over that by
-    the curvature; none in older maps.  rendered: these in words.  difference: scale of render(+step) - render(-step).  file: of
+    the curvature.  rendered: these in words.  difference: scale of render(+step) - render(-step).  file: of
     the pictures, NAME.npz.
     """
 

@@ -4,9 +4,8 @@ Every threshold makes the image a discontinuous or merely piecewise smooth funct
 those of the original 3DGS rasterizer (Kerbl et al. 2023).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from landscape.errors import InputError
 from splat.model.typed import NonNegative, Positive, Settings
@@ -73,16 +72,3 @@ class RenderSettings(Settings):
     def floor(self, dtype: "torch.dtype") -> float:
         """The transmittance beneath which a pixel of dtype stops: in float64 TIE above transmittance_min."""
         return self.transmittance_min * (1 + TIE if dtype.itemsize == 8 else 1)
-
-
-def current_settings(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of `RenderSettings` under their names of today, from those of an older configuration.
-
-    `accumulation` was called `sums` ("ordered" for "deterministic"), and was missing before; so was `antialias`.
-
-    >>> current_settings({"blur": 0.3, "sums": "ordered"})
-    {'antialias': 'none', 'blur': 0.3, 'accumulation': 'deterministic'}
-    """
-    fields = {"antialias": "none"} | {name: value for name, value in stored.items() if name != "sums"}
-    accumulation = fields.setdefault("accumulation", stored.get("sums", "deterministic"))
-    return {**fields, "accumulation": "deterministic" if accumulation == "ordered" else accumulation}

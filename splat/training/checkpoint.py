@@ -25,7 +25,6 @@ from landscape.results import Brief
 from splat.losses.reference import LossSettings
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
-from splat.model.settings import current_settings
 from splat.model.typed import MOST, Count, leaves, typed
 from splat.model.untrusted import replacing, require_whole
 from splat.scenes.scene import Scene
@@ -41,18 +40,6 @@ from splat.training.state import Method, TrainConfig, Training
 
 FORMAT, VERSION = "splat-landscape checkpoint", 3
 KIND = "expected a checkpoint written by landscape train"
-# settings that older files may lack: those trainings had what are now the defaults
-LATER = {
-    "protocol",
-    "loss.border",
-    "loss.opacity_reg",
-    "loss.scale_reg",
-    "clamp_image",
-    "rates.position_hold",
-    "densify.split_distance",
-    "densify.grow_opacity",
-    "densify.first_reset",
-}
 REMEDY = "take another copy of the file, or train anew"
 
 
@@ -357,15 +344,14 @@ def restored_training(content: dict[str, Any]) -> Training:
 
 
 def _config(content: dict[str, Any]) -> TrainConfig:
-    """The settings of a training: all have to be there, except LATER and `MethodSettings.BEFORE`."""
-    method, render = (typed(dict[str, Any], content.get(key), f"config.{key}") for key in ("method", "render"))
+    """The settings of a training: all have to be there."""
+    method = typed(dict[str, Any], content.get("method"), "config.method")
     name = typed(str, method.get("name"), "config.method.name")
     if name not in METHODS:
         raise InputError(f"'config.method' has the unknown name {name[:80]!r}, expected one of {', '.join(METHODS)}")
-    method, render = {**METHODS[name].BEFORE, **method}, current_settings(render)
-    content = {**content, "render": render, "method": {}}
-    config = replace(typed(TrainConfig, content, "config"), method=typed(METHODS[name], method, "config.method"))
-    if different := (leaves({**content, "method": method}).keys() ^ leaves(asdict(config)).keys()) - LATER:
+    config = typed(TrainConfig, {**content, "method": {}}, "config")
+    config = replace(config, method=typed(METHODS[name], method, "config.method"))
+    if different := leaves(content).keys() ^ leaves(asdict(config)).keys():
         raise InputError(f"'config' has missing or unknown keys: {', '.join(sorted(map(str, different)))}")
     return config
 

@@ -83,13 +83,11 @@ class Step:
 class MethodSettings(Settings):
     """Settings of a method; `create` makes a `Method` from them.  name: its key in `methods.METHODS`.
 
-    ITERATIONS: default number of steps.  BEFORE: values of settings that older checkpoints lack, with which the method does
-    what it did when they were written.
+    ITERATIONS: default number of steps.
     """
 
     name: str = ""
     ITERATIONS: ClassVar[int] = 2000
-    BEFORE: ClassVar[dict[str, Any]] = {}
 
     def create(self, seed: int) -> "Method":
         """The method before its first step."""

@@ -169,7 +169,7 @@ def test_landscapes_of_different_functions_are_not_drawn_beside_each_other(
 
     recorded(runs[0], first)
     recorded(runs[1], None)
-    module.draw(runs)  # an older record does not say
+    module.draw(runs)  # one does not say
     recorded(runs[1], second)
     with pytest.raises(ValueError, match=f"expected runs with the {words}.*draw them apart"):
         module.draw(runs)

@@ -15,8 +15,7 @@ import torch
 
 from landscape.errors import InputError
 from splat.model.files.tensor_files import load_tensors
-from splat.model.settings import RenderSettings
-from splat.training.checkpoint import LATER, VERSION, load_checkpoint, save_checkpoint, write_atomically
+from splat.training.checkpoint import VERSION, load_checkpoint, save_checkpoint, write_atomically
 from splat.training.loop import train
 from splat.training.state import Training
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
@@ -214,7 +213,7 @@ def test_a_file_that_would_run_code_is_refused_and_runs_nothing(tmp_path):
 
 CHANGES = {
     "format": ("something else", "does not hold the format"),
-    "version": (99, "format version is 99"),
+    "version": (1, "format version is 1, this program reads 2 alone"),
     "torch": (2, "'torch': expected str, got int"),
     "step": (1000, "step 1000 is not among its 12"),
     "extent": (1e300, "extent is 1e.300"),
@@ -259,25 +258,6 @@ def test_a_ply_file_is_refused_by_its_name(tmp_path):
     path = tmp_path / "point_cloud.ply"
     path.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
     refused(path, r"damaged \(of other tools")
-
-
-def test_a_checkpoint_that_lacks_later_settings_stands_for_their_defaults(path):
-    content, config = torch.load(path, weights_only=True), load_checkpoint(path).training.config
-    for name in LATER:
-        *above, last = name.split(".")
-        del (content["config"][above[0]] if above else content["config"])[last]
-    torch.save(content, path)
-    assert load_checkpoint(path).training.config == config
-
-
-@pytest.mark.parametrize("older", [{}, {"sums": "ordered"}, {"sums": "atomic"}])
-def test_a_checkpoint_with_older_words_for_accumulation_is_read(path, older):
-    content = torch.load(path, weights_only=True)
-    del content["config"]["render"]["accumulation"]
-    content["config"]["render"] |= older
-    torch.save(content, path)
-    accumulation = "atomic" if older == {"sums": "atomic"} else "deterministic"
-    assert load_checkpoint(path).training.config.render == RenderSettings(accumulation=accumulation)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ score, which only the code does, is `densify.split_distance`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -61,7 +61,6 @@ class FSGS(MethodSettings):
     depth_until: Count = 9500
     depths: DepthKind = "disparity"
     released: bool = False
-    BEFORE: ClassVar[dict[str, Any]] = {"released": False}
 
     def create(self, seed: int) -> Method:
         return FSGSMethod(self, seed)

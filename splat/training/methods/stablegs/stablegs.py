@@ -29,7 +29,7 @@ of weight 0; viewpoints that see nothing; the edges without edge rotation.
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from math import inf
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from msgspec import Meta
@@ -89,7 +89,6 @@ class StableGS(MethodSettings):
     densify_after_warm_up: bool = False
     probe: ProbeSettings = field(default_factory=ProbeSettings)
     viewpoint: ViewpointSettings = field(default_factory=ViewpointSettings)
-    BEFORE: ClassVar[dict[str, Any]] = {"accuracy": inf, "densify_after_warm_up": False}
 
     def create(self, seed: int) -> Method:
         return StableGSMethod(self, seed)
