@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MOST_ROOMS = 9
 METHODS = "splat.training.methods.methods"  # its example is in the docstring of the module
 ORDER = {
-    "": "landscape splat analysis figures",
+    "": "landscape splat analysis figures notebooks",
     "landscape": "errors linalg probes results operators traces eigen spectrum slices",
     "splat": "model backend projection losses render gpu scenes curvature training",
     "analysis": "records console measures train probe slice runs bench commands",

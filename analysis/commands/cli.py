@@ -26,7 +26,7 @@ from analysis.console.failures import report
 from analysis.console.interruption import ignore, raising
 from analysis.console.options import REGISTRY
 from analysis.probe.options import ProbeOptions
-from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, TrajectoryOptions
+from analysis.runs.options import CompareOptions, SweepOptions, TrajectoryOptions
 from analysis.slice.options import SliceOptions
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError, did_you_mean
@@ -63,7 +63,6 @@ COMMANDS = {
         UncertaintyOptions, "analysis.commands.uses.uncertainty:run_uncertainty", recorded=True, compiles=True
     ),
     "compare": Command(CompareOptions, "analysis.runs.compare:run_compare"),
-    "claims": Command(ClaimsOptions, "analysis.runs.claims.command:run_claims"),
     "convert": Command(ConvertOptions, "analysis.commands.convert:run_convert"),
     "demo": Command(DemoOptions, "analysis.commands.demo:run_demo", compiles=True),
     "trajectory": Command(TrajectoryOptions, "analysis.runs.trajectories:run_trajectory"),

@@ -1,4 +1,4 @@
-"""Options of the commands on several runs: `landscape sweep`, `trajectory`, `compare` and `claims`."""
+"""Options of the commands on several runs: `landscape sweep`, `trajectory` and `compare`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -68,14 +68,3 @@ class CompareOptions:
     scene: Unset[Path] = None
     """Folder of the scene of other tools' files; those that were probed are opened as they were then."""
     foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
-
-
-@dataclass(frozen=True)
-class ClaimsOptions:
-    """Test the paper's nine statements on the trainings of a study, each with its interval over the seeds."""
-
-    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
-    """Folders that hold runs, such as that of a sweep, or the study.csv of an earlier call.
-    3dgs and stablegs decide most statements; the parts of stablegs and three seeds of each the others."""
-    out: Unset[Path] = None
-    """Folder of the page, the tables and the pictures.  Default: claims, in the first folder."""

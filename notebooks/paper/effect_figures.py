@@ -1,12 +1,6 @@
-"""Figures: the effects behind the verdicts on the paper's statements, and what goes with the score.
-
-`python -m figures.claims OUT` draws OUT/claims.png and OUT/claim-N.png, one for each statement, from OUT/claims.csv, and
-OUT/predictors.png from OUT/predictors.csv, as `landscape claims` wrote them.
-"""
+"""Figures: the effects behind the verdicts on the paper's statements, and what goes with the score."""
 
 import textwrap
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -14,16 +8,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from analysis.console.failures import program
 from analysis.records.findings import attribute_name
-from figures.scripts import folder_script
-from figures.style import BLUE, UNDETERMINED, VERMILION, new_figure, save, style
+from figures.style import BLUE, UNDETERMINED, VERMILION, new_figure, style
 
 UNITS = {"×": "ratio (×)", "dB": "PSNR gained (dB)", "": "share or correlation"}
 KINDS = {"all": "all runs", "between": "means of methods", "within": "seeds of a method"}
 VERDICTS = {"holds": BLUE, "holds in part": BLUE, "does not hold": VERMILION, "cannot be tested here": UNDETERMINED}
 ROW, PANEL, WRAP = 0.17, 1.05, 76  # inches; characters
-SMALL = 150  # dots per inch of a statement's own picture
 CROWDED = 1e3  # from the least ratio to the largest: powers of ten alone are labelled
 FAR = 1e4  # a ratio beyond this, or below its inverse, ends at the edge
 
@@ -121,16 +112,3 @@ def words_of(quantity: str) -> str:
     if quantity.startswith("trace_"):
         return f"trace of {attribute_name(quantity.removeprefix('trace_'))}"
     return WORDS.get(quantity, quantity.replace("_", " "))
-
-
-def draw(folder: Path, suffix: str) -> list[Path]:
-    claims, related = (pd.read_csv(folder / f"{name}.csv") for name in ("claims", "predictors"))
-    drawn = {"claims": draw_claims(claims), "predictors": draw_predictors(related)}
-    for number, part in claims.groupby("statement"):
-        drawn[f"claim-{number}"] = draw_claims(pd.DataFrame(part))
-        drawn[f"claim-{number}"].set_dpi(SMALL)
-    return [save(figure, folder / f"{name}.{suffix}") for name, figure in drawn.items()]
-
-
-if __name__ == "__main__":
-    program(partial(folder_script, draw, "the effects behind the verdicts", "claims"))

@@ -1,9 +1,6 @@
-"""Figures and tables of the study, from its stored results: `python -m figures.paper [RESULTS] [--out OUT]`.
+"""Figures of the study, and their captions.
 
-RESULTS/study.csv           the trainings, as `landscape claims` writes them; by default those in notebooks/results
-RESULTS/trajectories.csv    the records along some of them, as `landscape trajectory` writes them, where there are any
-
-OUT/claims, predictors      the effects behind the verdicts, and what goes with the score (`figures.claims`)
+OUT/claims, predictors      the effects behind the verdicts, and what goes with the score (`notebooks.paper.effect_figures`)
 OUT/budget                  after Fig. 8: PSNR on held-out views against the time of a training
 OUT/axes                    after Tables 2 and 4: what the axes of StableGS's probes gain, alone and together
 OUT/index                   after Fig. 7: the anisotropy index over the steps, with the band of the seeds
@@ -12,7 +9,6 @@ OUT/captions.md             a caption for each, and the nine verdicts, written f
 Each figure as PNG and PDF.  A cell of the study that was not run is named where its number would be.
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -22,18 +18,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from analysis.console.failures import program
-from analysis.records.run_files import read_trajectory
-from analysis.runs.claims.effects import BASE, LEAST, SCORE, STABLE, Interval, gains, log_ratios, numbers
-from analysis.runs.claims.predictors import predictors
-from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
-from analysis.runs.claims.table import FILE, read_table
-from figures.claims import draw_claims, draw_predictors, words_of
-from figures.scripts import print_files
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
+from notebooks.paper.effect_figures import draw_claims, draw_predictors, words_of
+from notebooks.paper.effects import BASE, LEAST, SCORE, STABLE, Interval, gains, log_ratios, numbers
+from notebooks.paper.predictors import predictors
+from notebooks.paper.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
 from splat.model.untrusted import replacing
 
-RESULTS = Path(__file__).parents[1] / "notebooks" / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 LETTER, ROW = 4.4, 8.5  # points: as wide as a letter of a name on the average, and as high
 BUDGET = 1.3  # the paper's time of StableGS over that of 3DGS, Sec. 4.3
 VIEWPOINTS = {"occlusion": "edge_rotation", "interpolation": "interpolation", "parallax": "parallax"}
@@ -58,20 +50,16 @@ AXES: tuple[tuple[str, str, float | None], ...] = (
 )
 
 
-def make(results: Path, out: Path) -> Iterator[Path]:
-    """Draw everything; gives each file when it is there.  FileNotFoundError where there is no study."""
-    table = results / FILE
-    if not table.is_file():
-        raise FileNotFoundError(f"expected study.csv in {results}, as landscape claims writes it, found none")
-    rows = read_table(table)
+def make(rows: pd.DataFrame, out: Path, along: pd.DataFrame | None = None) -> Iterator[Path]:
+    """Draw everything; gives each file when it is there.  along: records along some of the trainings."""
     drawn = {
         "claims": draw_claims(effect_table(judgements(rows))),
         "predictors": draw_predictors(predictors(rows)),
         "budget": draw_budget(rows),
         "axes": draw_axes(rows),
     }
-    if (results / "trajectories.csv").is_file():
-        drawn["index"] = draw_index(read_trajectory(results / "trajectories.csv"))
+    if along is not None:
+        drawn["index"] = draw_index(along)
     for name, figure in drawn.items():
         for suffix in ("png", "pdf"):
             yield save(figure, out / f"{name}.{suffix}")
@@ -282,17 +270,3 @@ def _trainings(rows: pd.DataFrame) -> str:
     names = [name for name in ("scene", "views", "steps", "size", "machine", "commit", "date") if name in rows]
     values = {name: ", ".join(dict.fromkeys(rows[name].dropna().astype(str))) for name in names}
     return f"{len(rows)} trainings. " + " ".join(f"{name.capitalize()}: {value}." for name, value in values.items())
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """`python -m figures.paper [RESULTS] [--out OUT]`"""
-    parser = argparse.ArgumentParser(description="Draw the figures of the study from its stored results.")
-    parser.add_argument("results", type=Path, nargs="?", default=RESULTS, help="folder with study.csv")
-    parser.add_argument("--out", type=Path, default=Path("runs/paper"), help="folder of the figures")
-    options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    return print_files(lambda: make(options.results, options.out))
-
-
-if __name__ == "__main__":
-    program(main)

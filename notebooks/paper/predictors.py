@@ -16,7 +16,7 @@ import pandas as pd
 
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.schema import INDICES
-from analysis.runs.claims.effects import SCORE
+from notebooks.paper.effects import SCORE
 
 QUANTITIES = (
     "train_psnr", "gaussians", *(f"trace_{name}" for name in ATTRIBUTES), "lambda_max", "lambda_second", "lambda_min", *INDICES,

@@ -1,4 +1,4 @@
-"""The paper's nine statements, each judged by the effects that decide it (`analysis.runs.claims.effects`).
+"""The paper's nine statements, each judged by the effects that decide it (`notebooks.paper.effects`).
 
 Claimed sizes are the paper's, at 10,000 steps.  Of several effects the first decides, unless a docstring says otherwise.
 """
@@ -11,7 +11,7 @@ import pandas as pd
 
 from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.schema import INDICES
-from analysis.runs.claims.effects import (
+from notebooks.paper.effects import (
     BASE,
     LEAST,
     SCORE,
@@ -222,7 +222,7 @@ STATEMENTS: tuple[Callable[[pd.DataFrame], Judgement], ...] = (
 
 
 def judgements(rows: pd.DataFrame) -> list[Judgement]:
-    """All nine, over the rows of a study (`analysis.runs.claims.study`)."""
+    """All nine, over the rows of a study (`notebooks.paper.study`)."""
     return [statement(rows) for statement in STATEMENTS]
 
 

@@ -1,4 +1,4 @@
-"""The runs of a study as a table, OUT/study.csv of `landscape claims`: a row for each run.
+"""The runs of a study as a table, OUT/study.csv of `python -m notebooks.paper`: a row for each run.
 
     scene, method, seed         method: its name and the settings that differ from its defaults, as in "stablegs vsp_weight=0"
     steps, views, size          of the training: steps, number of training views, and their sizes in pixels
@@ -39,10 +39,10 @@ from analysis.measures.units import step_lengths
 from analysis.records.provenance import require_own
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS, Made, MapRecord, read_map, read_scores
-from analysis.runs.claims.effects import STRETCHED
-from analysis.runs.claims.table import FILE, KEYS, read_table
 from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
 from landscape.errors import InputError
+from notebooks.paper.effects import STRETCHED
+from notebooks.paper.table import FILE, KEYS, read_table
 from splat.model.typed import leaves
 from splat.training.checkpoint import load_checkpoint
 from splat.training.methods.protocols import presets

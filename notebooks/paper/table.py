@@ -1,4 +1,4 @@
-"""The table of a study, as `landscape claims` writes it: its columns are those of `study.py`."""
+"""The table of a study, as `python -m notebooks.paper` writes it: its columns are those of `study.py`."""
 
 import reprlib
 from pathlib import Path

@@ -15,7 +15,7 @@ from analysis.records.records import ProbeRecord, SliceRecord, read_record
 from analysis.records.run_files import COMPARISON, MapRecord
 from analysis.runs.compare import PAGE, TABLE
 from analysis.runs.sweep.sweep import CELLS_ELSEWHERE
-from figures import paper
+from notebooks.paper import __main__ as paper
 from splat.model.files.read import read_splats
 from splat.training.checkpoint import load_checkpoint
 from tests.hostile.ended import TRAINED, Ended, Numbers, bytes_of, digest, leaves, recorded, trained
@@ -243,40 +243,18 @@ class Trajectory(Files):
         return ["trajectory", str(self.checkpoint.parent), "--out", str(self.out)]
 
 
-class Claims(Files):
-    name, files = "claims", ("study.csv", "claims.csv", "predictors.csv", "claims.json")
-
-    def words(self) -> list[str]:
-        return ["claims", str(paper.RESULTS / "study.csv"), "--out", str(self.out)]
-
-
 class Paper(Files):
-    """`python -m figures.paper`; its PDFs hold the time."""
+    """`python -m notebooks.paper`; its PDFs hold the time."""
 
     name, module, files = (
-        "figures.paper",
+        "notebooks.paper",
         paper,
-        ("claims.png", "predictors.png", "budget.png", "axes.png", "captions.md"),
+        ("study.csv", "claims.csv", "predictors.csv", "claims.png", "budget.png", "axes.png", "captions.md"),
     )
 
     def words(self) -> list[str]:
         return ["--out", str(self.out)]
 
 
-KINDS = (
-    Train,
-    Probe,
-    Slice,
-    Map,
-    Convert,
-    Sweep,
-    Prune,
-    NextView,
-    NextStudy,
-    Uncertainty,
-    Compare,
-    Trajectory,
-    Claims,
-    Paper,
-)
+KINDS = (Train, Probe, Slice, Map, Convert, Sweep, Prune, NextView, NextStudy, Uncertainty, Compare, Trajectory, Paper)
 COMMANDS: dict[str, type[Ended]] = {each.name: each for each in KINDS}

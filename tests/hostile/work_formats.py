@@ -48,7 +48,7 @@ class StudyCsv(Format):
     name = "study.csv"
 
     def write(self) -> None:
-        from tests.analysis.runs.test_claims import PAPER, made_up
+        from tests.notebooks.test_claims import PAPER, made_up
 
         made_up(PAPER).to_csv(self.root / self.name, index=False)
 
@@ -58,19 +58,20 @@ class StudyCsv(Format):
     def use(self) -> None:
         from rich.console import Console
 
-        from analysis.runs.claims.command import _print, render_page
-        from analysis.runs.claims.predictors import predictors
-        from analysis.runs.claims.statements import effect_table, judgements
-        from analysis.runs.claims.study import study
+        from notebooks.paper.__main__ import tell
+        from notebooks.paper.figures import captions
+        from notebooks.paper.predictors import predictors
+        from notebooks.paper.statements import effect_table, judgements
+        from notebooks.paper.study import study
 
         rows = study([self.root / self.name])
         found = judgements(rows)
         effect_table(found).to_csv(index=False)
         with io.StringIO() as quiet:
-            _print(rows, found, Console(file=quiet))
+            tell(rows, found, Console(file=quiet))
         if self.chance.random() < DRAWN:
             predictors(rows)
-            render_page(rows, found, self.root)
+            captions(rows, ["predictors", "budget", "axes"])
 
 
 class KeptStages(Format):

@@ -1,6 +1,5 @@
 """Verdicts follow the numbers: a study made up as the paper has it, one as it does not, and what neither decides."""
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -10,17 +9,17 @@ import pandas as pd
 import pytest
 from msgspec import convert
 
-from analysis.commands.cli import main
 from analysis.console.overrides import assignments, overridden
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.schema import Anisotropy, End, Family, Index
-from analysis.runs.claims.effects import Interval, gains, log_ratios
-from analysis.runs.claims.predictors import predictors
-from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, judgements
-from analysis.runs.claims.study import _hutchinson, _more, _runs, method_name, study, unended
 from analysis.runs.sweep.sweep_file import read_sweep
-from figures.paper import ONLY
+from notebooks.paper.__main__ import main
+from notebooks.paper.effects import Interval, gains, log_ratios
+from notebooks.paper.figures import ONLY
+from notebooks.paper.predictors import predictors
+from notebooks.paper.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, judgements
+from notebooks.paper.study import _hutchinson, _more, _runs, method_name, study, unended
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
 from splat.training.start import Source
@@ -28,6 +27,7 @@ from splat.training.state import LearningRates, TrainConfig
 from tests.recorded import synthetic, written
 
 LARGER = ("literal", "saddle", "share")  # the more anisotropic
+NAMES = ("claims", "predictors", "budget", "axes")
 STABLE, ALONE = "stablegs", "stablegs vsp_weight=0"
 PAPER = {"literal": 0.26, "psnr": 4.9, "attributes": 2.92, "viewpoints": 2.29, "means": 2.46, "depth": 100.0, "needles": 0.9,
          "ranks": 1e4, "time": 1.25, "lambda": 0.3, "elongation": 0.5, "opacity": 0.6}  # fmt: skip
@@ -168,7 +168,7 @@ def test_a_row_has_the_curvature_that_adams_steps_see(tmp_path, attribute, exten
 def test_a_map_of_a_run_adds_what_one_view_sees(tmp_path, monkeypatch):
     from types import SimpleNamespace
 
-    from analysis.runs.claims import study as module
+    from notebooks.paper import study as module
 
     shares = {"quats": 0.6, "log_scales": 0.5}
     fragile = SimpleNamespace(opacity_one_view=0.25, needles=0.1, needles_trace=shares, depth_gradient=None)
@@ -223,23 +223,21 @@ def test_the_gains_of_three_views_are_not_judged_on_runs_of_others():
     assert judgements(rows.assign(views=8))[8].verdict == "cannot be tested here"
 
 
-def test_the_command_reads_a_table_and_draws(tmp_path, capsys):
+def test_the_command_reads_a_table_and_writes_it_with_its_verdicts(tmp_path, capsys):
     made_up(PAPER).to_csv(tmp_path / "study.csv", index=False)
-    assert main(["claims", str(tmp_path / "study.csv")]) == 0
-    out = tmp_path / "claims"
-    assert {path.name for path in out.iterdir()} == {
-        "study.csv", "claims.csv", "predictors.csv", "claims.json", "claims.html", "claims.png", "predictors.png",
-        *(f"claim-{number}.png" for number in range(1, 10)),
-    }  # fmt: skip
-    assert [each["verdict"] for each in json.loads((out / "claims.json").read_text())] == ["holds"] * 9
-    assert "holds" in capsys.readouterr().out
-    assert (out / "claims.html").read_text().count("<img ") == 9 + 1  # one for each, and the predictors
+    out = tmp_path / "out"
+    assert main([str(tmp_path / "study.csv"), "--out", str(out)]) == 0
+    wanted = {f"{name}.{suffix}" for name in NAMES for suffix in ("png", "pdf")} | {"captions.md"}
+    wanted |= {"study.csv", "claims.csv", "predictors.csv"}
+    said = capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == wanted and all(str(out / name) in said for name in wanted)
+    assert said.count("\n   holds: ") == 9
     again = study([out / "study.csv"])
     assert [each.verdict for each in judgements(again)] == ["holds"] * 9
 
 
 def test_the_stored_study_is_read_with_all_of_its_rows():
-    path = Path(__file__).parents[3] / "notebooks" / "results" / "study.csv"
+    path = Path(__file__).parents[2] / "notebooks" / "results" / "study.csv"
     rows = study([path])
     assert len(rows) == len(path.read_text().splitlines()) - 1 and set(rows["lambda_max_reason"]) == {"tolerance"}
 
@@ -259,7 +257,7 @@ def test_a_table_of_something_else_and_a_run_named_twice_are_refused(tmp_path, c
     for arguments in (["other.csv"], ["study.csv", "study.csv"], ["."]):
         (tmp_path / "empty").mkdir(exist_ok=True)
         paths = [str(tmp_path / name) if name != "." else str(tmp_path / "empty") for name in arguments]
-        assert main(["claims", *paths]) == 2
+        assert main(paths) == 2
         assert "expected" in capsys.readouterr().err
 
 
@@ -271,7 +269,7 @@ def test_a_protocol_is_named_and_not_its_settings():
     assert method_name(overridden(config, {"neighbours": "4"})) == "fsgs protocol=llff neighbours=4"
 
 
-NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
+NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 
 
 def names_in(file: str) -> set[str]:

@@ -6,20 +6,11 @@ import pytest
 from matplotlib.text import Text
 
 from figures import uses
-from figures.paper import AXES, captions, draw_axes, draw_budget, draw_index, main, method_words
 from landscape.errors import InputError
-from tests.analysis.runs.test_claims import OTHERWISE, PAPER, made_up
+from notebooks.paper.__main__ import main
+from notebooks.paper.figures import AXES, captions, draw_axes, draw_budget, draw_index, method_words
 from tests.figures.test_figures import laid_out
-
-NAMES = ("claims", "predictors", "budget", "axes")
-
-
-def test_every_figure_is_made_from_the_table_alone(tmp_path, capsys):
-    made_up(PAPER).to_csv(tmp_path / "study.csv", index=False)
-    assert main([str(tmp_path), "--out", str(tmp_path / "out")]) == 0
-    wanted = {f"{name}.{suffix}" for name in NAMES for suffix in ("png", "pdf")} | {"captions.md"}
-    assert {path.name for path in (tmp_path / "out").iterdir()} == wanted
-    assert len(capsys.readouterr().out.splitlines()) == len(wanted)
+from tests.notebooks.test_claims import NAMES, OTHERWISE, PAPER, made_up
 
 
 def test_captions_change_with_the_numbers():
@@ -70,7 +61,7 @@ def test_the_index_over_the_steps_has_the_band_of_all_seeds():
 
 def test_a_folder_without_a_study_is_refused_in_a_sentence(tmp_path, capsys):
     assert main([str(tmp_path)]) == 2
-    assert "expected study.csv" in capsys.readouterr().err
+    assert "expected a run that has ended, a folder of such or the table study.csv" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("content", ["", 'a,"b\n1', "x,y\n1,2\n"], ids=["empty", "damaged", "another table"])
