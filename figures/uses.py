@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
@@ -103,28 +102,7 @@ def draw_gains(table: pd.DataFrame) -> Figure:
     return figure
 
 
-def draw_study(table: pd.DataFrame) -> Figure:
-    """Held-out PSNR by the number of views: means over the seeds, and dots for each of them."""
-    scenes = list(dict.fromkeys(table["scene"]))
-    with style():
-        figure = new_figure(2.6, 3.3 * len(scenes))
-        for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
-            for place, name in enumerate([name for name in RULES if name in {*table["rule"]}]):
-                words, colour = RULES[name]
-                rows = _rows(table, scene=scene, rule=name)
-                mean = rows.pivot_table(index="views", values="psnr")  # by default the mean
-                axes.plot(mean.index, mean["psnr"], color=colour, label=words)
-                axes.plot(
-                    rows["views"] + 0.03 * place, rows["psnr"], color=colour, marker=".", markersize=3, linestyle="none"
-                )
-            axes.set(title=literal(scene), xlabel="training views", ylabel="held-out views, PSNR (dB)")
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-            axes.grid(visible=True)
-            axes.legend()
-    return figure
-
-
-PICTURES = {"curve": draw_curve, "gains": draw_gains, "study": draw_study}
+PICTURES = {"curve": draw_curve, "gains": draw_gains}
 
 
 def draw_uncertainty(path: Path) -> Figure:

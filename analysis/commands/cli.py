@@ -58,7 +58,9 @@ COMMANDS = {
     "map": Command(MapOptions, "analysis.commands.map.command:run_map", recorded=True, draws="maps", compiles=True),
     "view": Command(ViewOptions, "analysis.commands.view.command:run_view", compiles=True),
     "prune": Command(PruneOptions, "analysis.commands.uses.prune:run_prune", recorded=True, compiles=True),
-    "next-view": Command(NextViewOptions, "analysis.commands.uses.study:run_next", recorded=True, compiles=True),
+    "next-view": Command(
+        NextViewOptions, "analysis.commands.uses.next_view:run_next_view", recorded=True, compiles=True
+    ),
     "uncertainty": Command(
         UncertaintyOptions, "analysis.commands.uses.uncertainty:run_uncertainty", recorded=True, compiles=True
     ),

@@ -1,38 +1,26 @@
-"""`python -m analysis.runs.curves RUNS`: loss and scores along trainings that kept their checkpoints.
+"""Loss and scores along trainings that kept their checkpoints.
 
 RUNS/SCENE/METHOD/SEED/curve.csv    of every run of a sweep with `keep_checkpoints = "all"`: a row for each checkpoint
-RUNS/curves.csv                     all of them, with scene, method and seed
 
     step, cpu       steps so far, and the seconds of all processors that they took (train.csv)
     passes          over the pixels of one view: two a step of Adam, else as history.csv has them
     loss, psnr      of all training views: the mean of the training's loss, and dB
     held_out        dB of the held-out views
-
-What is there already is not made again.  `python -m figures.second_order RUNS` draws them.
-
-`--against METHOD` prints, as means over the seeds that both have with standard deviations, how many of METHOD's seconds each
-method takes to METHOD's last loss (on a straight line of ln loss between checkpoints), and the last held-out dB.
 """
 
-import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
-from rich.progress import track
 
-from analysis.console.failures import program
-from analysis.console.plain import say
 from analysis.records.run_files import CHECKPOINT
 from landscape.errors import InputError
 from splat.scenes.view import View
-from splat.training.checkpoint import load_checkpoint, write_atomically
+from splat.training.checkpoint import load_checkpoint
 from splat.training.score.evaluate import evaluate
 
-CURVE, CURVES, LOG, HISTORY = "curve.csv", "curves.csv", "train.csv", "history.csv"
+LOG, HISTORY = "train.csv", "history.csv"
 OF_ADAM = 2  # forward and backward
 
 
@@ -116,35 +104,3 @@ def reached(run: pd.DataFrame, loss: float) -> float:
         return float(seconds[0])
     share = np.log(losses[after - 1] / loss) / np.log(losses[after - 1] / losses[after])
     return float(seconds[after - 1] + share * (seconds[after] - seconds[after - 1]))
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="analysis.runs.curves", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("runs", type=Path, metavar="RUNS")
-    parser.add_argument("--against", metavar="METHOD")
-    arguments = parser.parse_args(words)
-    runs = arguments.runs
-    ended = sorted(path.parent for path in runs.glob("*/*/*/metrics.json"))
-    console = Console(stderr=True)
-    try:
-        if not ended:
-            raise InputError(f"expected runs that have ended in {runs}, got none; landscape sweep makes them")
-        for run in track([run for run in ended if not (run / CURVE).is_file()], "curves", console=console):
-            write_atomically(run / CURVE, curve(run).to_csv(index=False).encode())
-        tables = [
-            pd.read_csv(run / CURVE).assign(scene=scene, method=method, seed=seed)
-            for run in ended
-            for scene, method, seed in [run.parts[-3:]]
-        ]
-        table = pd.concat(tables, ignore_index=True)
-        write_atomically(runs / CURVES, table.to_csv(index=False).encode())
-        if arguments.against:
-            say(against(table, arguments.against).to_string(index=False), console=Console())
-    except (InputError, FileNotFoundError) as error:
-        say(f"analysis.runs.curves: {error}", console=console)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    program(main)

@@ -1,19 +1,12 @@
 """Figure: training loss and held-out PSNR of steps of second order beside Adam, over seconds and over passes.
 
-`python -m figures.second_order RUNS` draws RUNS/curves.csv, which `analysis.runs.curves` wrote; one picture for each scene,
-RUNS/SCENE.png.  Lines: means over the seeds that have ended, at equal steps; bands: from the lowest seed to the highest.
+Lines: means over the seeds that have ended, at equal steps; bands: from the lowest seed to the highest.
 """
-
-from functools import partial
-from pathlib import Path
 
 import pandas as pd
 from matplotlib.figure import Figure
 
-from analysis.console.failures import program
-from figures.scripts import folder_script
-from figures.style import RUNS, literal, new_figure, save, style
-from landscape.errors import InputError
+from figures.style import RUNS, literal, new_figure, style
 
 ACROSS = {"cpu": "seconds of one processor", "passes": "passes over the pixels of a view"}
 UP = {"loss": "training loss", "held_out": "held-out PSNR, dB"}
@@ -45,17 +38,3 @@ def draw_scene(table: pd.DataFrame) -> Figure:
         figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
         figure.suptitle("lines: means over the seeds; bands: from the lowest to the highest", fontsize=7)
     return figure
-
-
-def draw(runs: Path, suffix: str) -> list[Path]:
-    path = runs / "curves.csv"
-    if not path.is_file():
-        raise InputError(f"expected {path}, found none; python -m analysis.runs.curves {runs}")
-    return [
-        save(draw_scene(pd.DataFrame(rows)), runs / f"{scene}.{suffix}")
-        for scene, rows in pd.read_csv(path).groupby("scene")
-    ]
-
-
-if __name__ == "__main__":
-    program(partial(folder_script, draw, "loss and scores along trainings", "sweep"))

@@ -1,4 +1,4 @@
-"""`landscape next-view FILE.toml`: train on few views, pick further ones by each rule, train on, score the held-out views.
+"""Study of next views: train on few views, pick further ones by each rule, train on, score the held-out views.
 
     out = "../runs/next-view"       # folder of the results
     rules = ["d", "t", "published", "uniform", "random"]
@@ -14,23 +14,24 @@
 
 Paths are relative to the file.  uniform: the camera that is farthest from all that are chosen; random: by the seed.  A rule, a
 scene and a seed make a cell, OUT/cells/SCENE-RULE-SEED.json; those that there are stay, so that the same command continues.
-OUT/study.csv: a row for each round of each cell; study.png.
+OUT/study.csv: a row for each round of each cell; study.png: held-out PSNR by the number of views.
 """
 
 import tomllib
-from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 import pandas as pd
 import torch
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 
-from analysis.commands.uses.next_view import informations, picked, run_next_view
-from analysis.commands.uses.options import NextViewOptions
-from analysis.console.drawing import draw_or_say
+from analysis.commands.uses.next_view import informations, picked
 from analysis.console.plain import say
 from analysis.records.json_files import json_text
+from figures.style import literal, new_figure, save, style
+from figures.uses import RULES as LOOKS
 from landscape.errors import InputError
 from splat.curvature.scores.information import GAINS
 from splat.scenes.scene import Scene, load_scene
@@ -66,12 +67,6 @@ class Study(msgspec.Struct, forbid_unknown_fields=True):
 Row = dict[str, str | int | float]
 
 
-def run_next(options: NextViewOptions, command: Sequence[str]) -> int:
-    """The study of a TOML file, or the candidates of a checkpoint; returns the exit code."""
-    path = options.checkpoint
-    return run_study(path) if path.suffix == ".toml" else run_next_view(options, command)
-
-
 def run_study(file: Path) -> int:
     """Run the cells that are missing; returns the exit code."""
     try:
@@ -98,9 +93,8 @@ def run_study(file: Path) -> int:
         say(f"{done + 1} of {len(cells)}: {name}, {rule}, seed {seed}: {last}", console=console)
     table = pd.DataFrame(rows)
     write_atomically(out / "study.csv", table.to_csv(index=False).encode())
-    notes = draw_or_say("uses", out)
+    save(draw_study(table), out / "study.png")
     last = table[table["round"] == study.rounds].groupby(["scene", "rule"])["psnr"].agg(["mean", "std", "count"])
-    say(*notes, style="yellow", console=console)
     say(last.round(2).to_string(), f"study.csv, study.png in {out}")
     return 0
 
@@ -160,3 +154,24 @@ def _train_on(training: Training, views: list[View], until: int) -> None:
     for done in train(training, views):
         if done.step == until:
             return
+
+
+def draw_study(table: pd.DataFrame) -> Figure:
+    """Held-out PSNR by the number of views: means over the seeds, and dots for each of them."""
+    scenes = list(dict.fromkeys(table["scene"]))
+    with style():
+        figure = new_figure(2.6, 3.3 * len(scenes))
+        for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
+            for place, name in enumerate([name for name in LOOKS if name in {*table["rule"]}]):
+                words, colour = LOOKS[name]
+                rows = pd.DataFrame(table[(table["scene"] == scene) & (table["rule"] == name)])
+                mean = rows.pivot_table(index="views", values="psnr")  # by default the mean
+                axes.plot(mean.index, mean["psnr"], color=colour, label=words)
+                axes.plot(
+                    rows["views"] + 0.03 * place, rows["psnr"], color=colour, marker=".", markersize=3, linestyle="none"
+                )
+            axes.set(title=literal(scene), xlabel="training views", ylabel="held-out views, PSNR (dB)")
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+            axes.grid(visible=True)
+            axes.legend()
+    return figure

@@ -16,6 +16,7 @@ from analysis.records.run_files import COMPARISON, MapRecord
 from analysis.runs.compare import PAGE, TABLE
 from analysis.runs.sweep.sweep import CELLS_ELSEWHERE
 from notebooks.paper import __main__ as paper
+from notebooks.uses import __main__ as uses
 from splat.model.files.read import read_splats
 from splat.training.checkpoint import load_checkpoint
 from tests.hostile.ended import TRAINED, Ended, Numbers, bytes_of, digest, leaves, recorded, trained
@@ -189,7 +190,8 @@ class Files(Ended):
 class NextStudy(Files):
     """Goes on from the cells that there are."""
 
-    name, files = "next-view-study", ("study.csv", "cells/tiny-d-0.json", "cells/tiny-random-0.json")
+    name, module = "notebooks.uses", uses
+    files = ("study.csv", "cells/tiny-d-0.json", "cells/tiny-random-0.json")
 
     def words(self) -> list[str]:
         file = self.scene.with_name("study.toml")
@@ -197,7 +199,7 @@ class NextStudy(Files):
             'out = "work/out"\nrules = ["d", "random"]\nseeds = [0]\nrounds = 1\nfirst_steps = 4\nsteps = 2\n'
             f'[scenes.tiny]\npath = "{self.scene}"\n'
         )
-        return ["next-view", str(file)]
+        return [str(file)]
 
 
 class Compare(Files):

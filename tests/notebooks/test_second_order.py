@@ -4,9 +4,9 @@ import pandas as pd
 import pytest
 
 from analysis.commands.cli import main
-from analysis.runs.curves import CURVE, CURVES, against
-from analysis.runs.curves import main as curves
-from figures.second_order import draw
+from notebooks.second_order.__main__ import CURVE, CURVES
+from notebooks.second_order.__main__ import main as curves
+from notebooks.second_order.curves import against
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
@@ -38,7 +38,7 @@ def runs(tmp_path_factory):
     write_transforms_scene(made.scene, folder / "still")
     (folder / "sweep.toml").write_text(SWEEP)
     assert main(["sweep", str(folder / "sweep.toml"), "--out", str(folder / "runs"), "--jobs", "1"]) == 0
-    assert curves([str(folder / "runs")]) == 0
+    assert curves([str(folder / "runs"), "--out", str(folder / "pictures")]) == 0
     return folder / "runs"
 
 
@@ -66,7 +66,13 @@ def test_a_cell_starts_from_the_checkpoint_of_its_seed(runs):
 
 
 def test_the_picture_is_drawn_for_every_scene(runs):
-    assert [path.name for path in draw(runs, "png")] == ["polish.png", "still.png"]
+    assert {path.name for path in runs.with_name("pictures").iterdir()} == {"polish.png", "still.png"}
+
+
+def test_the_stored_curves_are_drawn(tmp_path, capsys):
+    assert curves(["--out", str(tmp_path), "--against", "adam"]) == 0
+    said, files = capsys.readouterr().out, sorted(path.name for path in tmp_path.iterdir())
+    assert files and all(file in said for file in files) and "gn-cg" in said
 
 
 def test_seconds_to_the_loss_of_another_method_are_shares_of_its_own():

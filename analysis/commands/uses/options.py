@@ -39,12 +39,10 @@ class PruneOptions:
 
 @dataclass(frozen=True)
 class NextViewOptions:
-    """Say which further photograph would tell most about a scene, before it is taken; or run a study of such choices."""
+    """Say which further photograph would tell most about a scene, before it is taken."""
 
     checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply.
-    A FILE.toml: a study that trains, picks and trains on, as analysis/commands/uses/study.py describes; continues where it was
-    stopped."""
+    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
     candidates: UseAppendAction[tuple[str, ...]] = ()
     """A view of the scene whose camera to judge, by name; may be given again.
     Default: all that are neither trained on nor held out."""
@@ -55,7 +53,7 @@ class NextViewOptions:
     (FisherRF's)."""
     scene: SceneFolder = None
     out: Unset[Path] = None
-    """Folder of the results.  Default: next-view, beside the checkpoint; of a study as its file says."""
+    """Folder of the results.  Default: next-view, beside the checkpoint."""
     foreign: Foreign = field(default_factory=ForeignOptions)
 
 
