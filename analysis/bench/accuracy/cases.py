@@ -1,219 +1,78 @@
-"""Cases of the accuracy study: operators with known traces, spectrum and diagonal, and the cost of their products.
+"""A trained scene as a case of the accuracy study.  Its truth is a long run, kept in OUT/truth.json:
 
-    splats      the Hessian of a small synthetic scene as a dense matrix in float64, whose eigendecomposition is the truth.
-                Methods get the same matrix in float32; a product costs what the scene's kernels take for it.  Only
-                `exact_traces`, which needs more than products, and the comparison of precisions run on the scene itself.
-    matrices    random eigenvectors, prescribed eigenvalues
-    checkpoint  a trained scene, with a converged long run as truth (`analysis.bench.accuracy.checkpoint`)
+    traces    `exact_traces` of SAMPLES samples
+    ends      Lanczos to a residual of FINE
+    sums      quadrature with STARTS x STEPS products
 
-The scale of a block's trace is sum |H_ii| over the block (over all rows where the block is zero).  That of an end of the
-spectrum is its magnitude, as in the stopping rules of all methods (the larger end's, where it is zero to round-off).
+The file belongs to one checkpoint at one size of its pictures; for another it is computed again.  The truth of the sums is
+known to half its brackets, a few percent; estimates that are more accurate cannot be compared.  There is no truth of the
+diagonal, which would take a product for every row.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from time import perf_counter
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
 
 import torch
-from jaxtyping import Float64
-from torch import Tensor
 
-from landscape.eigen.eigen import extreme_eigenpairs
-from landscape.eigen.pairs import EigenEnds
-from landscape.operators.operator import DenseOperator, SymmetricOperator, require_vectors
-from landscape.spectrum.density import ActiveSpace
+from analysis.bench.accuracy.cases import Case, Truth
+from analysis.bench.workloads import workload_of
+from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
+from landscape.spectrum.absolute_sum import absolute_sum
+from landscape.spectrum.anisotropy import effective_rank
+from landscape.spectrum.density import ActiveSpace, spectral_density
+from landscape.traces.trace import TraceSettings, total_trace
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
-from splat.losses.reference import LossSettings
-from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.curvature.traces import exact_traces
+from splat.training.checkpoint import write_atomically
 
-ROWS = 200  # of a random matrix
-WIDTHS = (1, 2, 4, 8)  # vectors at a time whose product is timed
-SETTINGS = SyntheticSettings(60, 2, 24, 18, sh_degree=0)
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """True values that estimates are compared with.  diagonal: None where not known."""
-
-    traces: Mapping[str, float]
-    scales: Mapping[str, float]
-    largest: float
-    smallest: float
-    absolute_sum: float
-    effective_rank: float
-    diagonal: Float64[Tensor, " n"] | None
-
-    @classmethod
-    def of(cls, matrix: Float64[Tensor, "n n"], blocks: Mapping[str, slice]) -> "Truth":
-        """The truth of a dense matrix."""
-        values, diagonal = torch.linalg.eigvalsh(matrix), matrix.diagonal()
-        total = float(values.abs().sum())
-        return cls(
-            traces={name: float(diagonal[rows].sum()) for name, rows in blocks.items()},
-            scales={name: float(diagonal[rows].abs().sum() or diagonal.abs().sum()) for name, rows in blocks.items()},
-            largest=float(values[-1]),
-            smallest=float(values[0]),
-            absolute_sum=total,
-            effective_rank=total**2 / float(values.square().sum()),
-            diagonal=diagonal.clone(),
-        )
+SAMPLES, FINE, MOST = 128, 1e-6, 250  # MOST: products of the search for the ends
+STARTS, STEPS = 6, 24
+TRUTH = "truth.json"
 
 
-@dataclass(frozen=True, eq=False)
-class Case:
-    """An operator with its true values.
-
-    price: seconds of a product with k vectors; None: those measured.  objective: the scene, None of a matrix.  products: the
-    scene's kernels by precision, None of a matrix.
-    """
-
-    name: str
-    family: str
-    operator: SymmetricOperator
-    truth: Truth
-    price: Callable[[int], float] | None = None
-    objective: SceneObjective | None = None
-    active: ActiveSpace | None = None
-    products: Mapping[torch.dtype, SymmetricOperator] | None = None
-
-    @property
-    def round_off(self) -> float:
-        """Round-off of an estimate, relative to its scale: sqrt(rows) eps, of independent roundings in every row."""
-        return self.operator.dim**0.5 * torch.finfo(self.operator.dtype).eps
-
-    @property
-    def scene(self) -> SceneObjective:
-        """The objective, of a case that is a scene."""
-        assert self.objective is not None
-        return self.objective
-
-    @cached_property
-    def ends(self) -> EigenEnds:
-        """Both ends, by `extreme_eigenpairs` with its defaults."""
-        return extreme_eigenpairs(self.operator, torch.Generator().manual_seed(0))
+def checkpoint_case(path: Path, out: Path, downscale: float = 1.0) -> Case:
+    """The case of a checkpoint; its truth is read from OUT/truth.json, or computed and written there."""
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a checkpoint as written by `landscape train`, got no file {path}")
+    workload = workload_of(path)
+    if downscale != 1:
+        workload = workload.resized(1 / downscale)
+    objective = SceneObjective(
+        workload.gaussians, workload.views, workload.loss, workload.background, workload.settings
+    )
+    hessian = SceneHessian(objective)
+    key = {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "downscale": downscale, "dim": hessian.dim}
+    stored = out / TRUTH
+    kept = json.loads(stored.read_text()) if stored.is_file() else {}
+    if kept.get("of") != key:
+        kept = {"of": key, "truth": asdict(_truth(objective, hessian))}
+        write_atomically(stored, json.dumps(kept, indent=1).encode())
+    active = ActiveSpace(hessian.project, hessian.rank)
+    return Case(workload.name, "checkpoint", hessian, Truth(**kept["truth"]), None, objective, active)
 
 
-class MeteredOperator:
-    """The operator of a case, which counts its products.
+def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:
+    def generator(stream: int) -> torch.Generator:
+        return torch.Generator().manual_seed(1_000_000 + stream)  # far from the seeds of the methods' runs
 
-    matvecs: vectors applied, and other work charged.  seconds: of the products, at the case's price where it has one; spent:
-    of the products as measured.
-    """
-
-    def __init__(self, case: Case) -> None:
-        self.inner, self.price = case.operator, case.price
-        self.dim, self.blocks, self.dtype = case.operator.dim, case.operator.blocks, case.operator.dtype
-        self.matvecs, self.seconds, self.spent = 0.0, 0.0, 0.0
-
-    def apply(self, V: Tensor) -> Tensor:
-        require_vectors(V, self.dim, self.dtype)
-        start = perf_counter()
-        result = _product(self.inner, V)
-        spent = perf_counter() - start
-        self.matvecs += V.shape[1]
-        self.spent += spent
-        self.seconds += spent if self.price is None else self.price(V.shape[1])
-        return result
-
-    def charge(self, matvecs: float) -> None:
-        """Count other work, in units of a product with one vector."""
-        self.matvecs += matvecs
-
-
-def _product(operator: SymmetricOperator, V: Tensor) -> Tensor:
-    """H V.  Of a matrix, only the columns from the first to the last row of V that is not 0: quick products of blocks."""
-    if not isinstance(operator, DenseOperator):
-        return operator.apply(V)
-    used = V.any(dim=1).nonzero()
-    rows = slice(int(used[0]), int(used[-1]) + 1) if len(used) else slice(0, 0)
-    return operator.matrix[:, rows] @ V[rows]
-
-
-# --- random matrices --------------------------------------------------------------------------------------------------
-
-
-def spectra() -> dict[str, Float64[Tensor, " n"]]:
-    """Spectra like those of curvature: a power law, clusters at the ends, both signs, few nonzero ones, none dominant."""
-    n, i = ROWS, torch.arange(ROWS, dtype=torch.float64)
-    ends = torch.where(i < 5, 1 - 1e-3 * i, torch.where(i >= n - 4, -0.3, 0.3 * i / n))
-    return {
-        "power law": (1 + i) ** -1.5,
-        "clustered": ends,
-        "indefinite": torch.where(i % 3 > 0, 1.0, -0.3) / (1 + i) ** 0.5,
-        "rank-deficient": torch.where(i < n // 40, 1 + i, torch.zeros_like(i)),
-        "flat": 1 + i / n,
+    traces = exact_traces(objective, generator(0), TraceSettings.fixed(SAMPLES))
+    scales = {
+        name: float(part.abs().sum()) for name, part in objective.block_diagonal(approximate=True).diagonals.items()
     }
-
-
-def matrix_cases(seed: int) -> Iterator[Case]:
-    """Dense float64 matrices with these spectra."""
-    for index, (name, values) in enumerate(spectra().items()):
-        generator = torch.Generator().manual_seed(1000 * seed + index)
-        n = len(values)
-        vectors = torch.linalg.qr(torch.randn(n, n, generator=generator, dtype=torch.float64)).Q
-        matrix = (vectors * values) @ vectors.T
-        operator = DenseOperator((matrix + matrix.T) / 2)
-        yield Case(name, "matrices", operator, Truth.of(operator.matrix, operator.blocks))
-
-
-# --- splats -----------------------------------------------------------------------------------------------------------
-
-
-def splat_cases(seed: int, scenes: int = 1) -> dict[str, Callable[[], Case]]:
-    """Constructors of the scenes, by name: two with SSIM, far from a fit and near it; one with the pixel loss alone, whose
-    traces are exact.  scenes: of each kind, from different seeds; the k-th is called NAME #k."""
-    kinds = {
-        "far from a fit": (0.2, LossSettings()),
-        "near a fit": (0.02, LossSettings()),
-        "pixel loss alone": (0.2, LossSettings(ssim_weight=0.0)),
-    }
-    found = {}
-    for k in range(scenes):
-        settings = replace(SETTINGS, seed=SETTINGS.seed + k)
-        for kind, (noise, loss) in kinds.items():
-            name = kind if k == 0 else f"{kind} #{k + 1}"
-            found[name] = partial(splat_case, name, noise, loss, seed + k, settings)
-    return found
-
-
-def splat_case(name: str, noise: float, loss: LossSettings, seed: int, settings: SyntheticSettings = SETTINGS) -> Case:
-    """The synthetic scene with `noise` on every stored parameter."""
-    made, generator = synthetic_scene(settings), torch.Generator().manual_seed(seed)
-    flat = made.truth.flat
-    gaussians = made.truth.with_flat(flat + noise * torch.randn(flat.shape, generator=generator, dtype=flat.dtype))
-    views = made.scene.load()
-    doubled = [replace(view, image=view.image.double()) for view in views]
-    single = SceneObjective(gaussians, views, loss)
-    exact = SceneObjective(single.active.to(torch.float64), doubled, loss)
-    H = SceneHessian(exact)
-    matrix = H.apply(torch.eye(H.dim, dtype=torch.float64))
-    matrix = (matrix + matrix.T) / 2
-    rough = SceneHessian(single)
-    operator = DenseOperator(matrix.float(), dict(H.blocks))
-    active = ActiveSpace(rough.project, rough.rank)
-    products = {torch.float32: rough, torch.float64: H}
-    return Case(name, "splats", operator, Truth.of(matrix, H.blocks), price_of(rough), single, active, products)
-
-
-def price_of(operator: SymmetricOperator) -> Callable[[int], float]:
-    """Seconds of a product with k vectors, split into the widest blocks of WIDTHS; a block's is the shortest of three."""
-    seconds = {}
-    for width in WIDTHS:
-        V = torch.ones(operator.dim, width, dtype=operator.dtype)
-        times = []
-        for _ in range(4):  # the first compiles and linearises
-            start = perf_counter()
-            operator.apply(V)
-            times.append(perf_counter() - start)
-        seconds[width] = min(times[1:])
-
-    def price(k: int) -> float:
-        total = 0.0
-        for width in reversed(WIDTHS):
-            total += k // width * seconds[width]
-            k %= width
-        return total
-
-    return price
+    ends = extreme_eigenpairs(hessian, generator(1), EigenSettings(rtol=FINE, basis=128, max_matvecs=MOST))
+    active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)
+    density = spectral_density(hessian, generator(2), STARTS * STEPS, STARTS, active=active, ends=ends, trace=trace)
+    rank = effective_rank(ends, density).value
+    assert rank is not None
+    return Truth(
+        traces={name: trace.value for name, trace in traces.items()},
+        scales=scales,
+        largest=float(ends.largest.values[0]),
+        smallest=float(ends.smallest.values[0]),
+        absolute_sum=absolute_sum(density).value or 0.0,
+        effective_rank=rank,
+        diagonal=None,
+    )
