@@ -1,6 +1,6 @@
-"""Figures: true error against products H v, a panel a case, one figure a quantity, from a recorded accuracy_points.csv.
+"""Figures: true error against products H v, a panel a case, one figure a quantity, from a recorded accuracy.csv.
 
-`python -m figures.accuracy BENCH/accuracy_points.csv` draws accuracy_QUANTITY beside the table.  Lines join the settings of a
+`python -m figures.accuracy BENCH/accuracy.csv` draws accuracy_QUANTITY beside the table.  Lines join the settings of a
 method; down and to the left is better.  The star is the library's default.
 """
 
@@ -25,7 +25,7 @@ LEGEND_LINE = 0.14
 
 
 def draw(table: pd.DataFrame, quantity: str) -> Figure:
-    """The cases of one quantity; table: the lines of accuracy_points.csv."""
+    """The cases of one quantity; table: the lines of accuracy.csv."""
     part = pd.DataFrame(table[table["quantity"] == quantity])
     cases = list(part["case"].unique())
     names = {origin: sorted(part.loc[part["origin"] == origin, "method"].unique()) for origin in LINES}
@@ -78,7 +78,7 @@ def _panel(axes: Axes, part: pd.DataFrame, looks: dict[tuple[str, str], tuple[st
 
 
 def draw_all(path: Path) -> Iterator[tuple[str, Figure]]:
-    """A figure for each quantity of accuracy_points.csv, and the name of its file."""
+    """A figure for each quantity of accuracy.csv, and the name of its file."""
     table = pd.read_csv(path)
     for quantity in table["quantity"].unique():
         words = "".join(c if c.isalpha() else "_" for c in quantity).strip("_")
@@ -87,4 +87,4 @@ def draw_all(path: Path) -> Iterator[tuple[str, Figure]]:
 
 if __name__ == "__main__":
     what = "error against work as recorded by `landscape bench accuracy`"
-    program(partial(table_script, draw_all, what, "accuracy_points.csv", "bench accuracy"))
+    program(partial(table_script, draw_all, what, "accuracy.csv", "bench accuracy"))

@@ -63,11 +63,6 @@ class Workload:
         """The Gaussians on a device, where all that is computed of them is then computed; views stay where they are."""
         return replace(self, gaussians=self.gaussians.with_flat(self.gaussians.flat.to(device)))
 
-    def thinned(self, count: int) -> "Workload":
-        """A random choice of the Gaussians."""
-        chosen = torch.randperm(len(self.gaussians), generator=torch.Generator().manual_seed(0))[:count]
-        return replace(self, gaussians=self.gaussians.select(chosen.sort().values))
-
     def resized(self, factor: float) -> "Workload":
         """The views with `factor` times as many pixels on a side."""
         return replace(self, views=tuple(_resized(view, factor) for view in self.views))
@@ -92,7 +87,7 @@ def _discoloured(gaussians: Gaussians) -> Gaussians:
 
 
 def workload_of(path: Path, images: str | None = None, downscale: float = 1.0) -> Workload:
-    """A checkpoint's Gaussians and training views; of a folder the start: all its points, SH degree 3, three views.
+    """A checkpoint's Gaussians and training views; of a scene's folder the start: all its points, SH degree 3, three views.
 
     Raises FileNotFoundError or ValueError where the path is neither, or the scene has no points.
     """

@@ -1,15 +1,10 @@
-"""The accuracy study: products H v and seconds against true error, of every estimator and setting and of other packages.
+"""The accuracy study: work against true error of every estimator, beside other packages: `python -m notebooks.accuracy`.
 
     OUT/accuracy.csv          a line for each case, quantity, part, method, settings and seed: matvecs, seconds, true and
                               reported error, whether the interval contains the truth (of a diagonal: the share of rows)
-    OUT/accuracy_points.csv   a line for each case, quantity, method and settings: means over parts and seeds, of errors root
-                              mean squares
+    OUT/accuracy_points.csv   a line for each case, quantity, method and settings: means over parts and seeds
     OUT/accuracy_ratios.csv   work of the default over that of the best peer ("peer") and of our best other setting ("own")
     OUT/accuracy_QUANTITY.png drawn by `figures.accuracy` from accuracy_points.csv
-
-Errors are relative to a scale: the sum of |H_ii| over the block (traces), |diag H|, and the value itself (ends, sums over the
-spectrum; the larger end where an end is zero).  Errors below the round-off of the products count as that.  Matvecs and seconds
-are those of all parts of a quantity together.
 
 **At equal true error.**  A ratio is the default's mean matvecs over those that a rival needs for the default's error e, the
 root mean square over all seeds.
@@ -22,37 +17,41 @@ root mean square over all seeds.
 - Peers without a stopping rule get the budget that reaches e, which their users cannot know.
 - The ratio's interval is a bootstrap over seeds.  The ratio asked for holds ("yes") where the whole interval is at most that,
   does not ("no") where the whole interval is above, and is "open" otherwise.
+
+`python -m notebooks.accuracy` repeats all of it; `--quantity ends --case flat` a part.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
 from math import nan
+from pathlib import Path
 from time import perf_counter
-from typing import get_args
 
 import pandas as pd
 import torch
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import track
 from torch import Tensor
 
-from analysis.bench.accuracy.cases import Case, MeteredOperator, matrix_cases, splat_cases
-from analysis.bench.accuracy.checkpoint import checkpoint_case
-from analysis.bench.accuracy.methods import BUDGETS, FEW_BUDGETS, Answer, Method, affordable, own_methods
-from analysis.bench.accuracy.peers import peer_methods
-from analysis.bench.accuracy.ratios import points, ratio_table, ratios
-from analysis.bench.options import BenchOptions, Quantity
+from analysis.bench.accuracy.cases import Case
+from analysis.bench.accuracy.command import Method, Run, measure, points
 from analysis.bench.tables import rich_table, write_table
 from analysis.console.drawing import draw
+from analysis.console.failures import program
 from analysis.console.plain import say
 from landscape.errors import InputError
 from landscape.operators.operator import DenseOperator, SymmetricOperator
 from landscape.probes import draw_probes
+from notebooks.accuracy.cases import StudyCase, matrix_cases, splat_cases
+from notebooks.accuracy.methods import own_methods
+from notebooks.accuracy.peers import peer_methods
+from notebooks.accuracy.ratios import ratio_table, ratios
 
+QUANTITIES = ("traces", "ends", "sums", "diagonal")
 SEED = 0
 TITLES = {"peer": "the defaults at equal true error: over the best peer", "own": "over our own best other setting"}
 # seeds over --repetitions: a scene gives five blocks' traces for each seed; other quantities vary less or take longer
-SEEDS_OF_FAMILY = {"matrices": 1.0, "splats": 0.2, "checkpoint": 0.14}
+SEEDS_OF_FAMILY = {"matrices": 1.0, "splats": 0.2}
 SEEDS_OF_QUANTITY = {"traces": 3.0, "ends": 0.5, "sums": 0.5, "diagonal": 1.0}
 # in place of the product of both: a rival that misses an end in one run of 20 needs more than 4 seeds
 SEEDS_OF_BOTH = {("splats", "ends"): 1.0}
@@ -67,77 +66,10 @@ PRECISIONS = {  # of the products, and of the sums over rows
 }
 
 
-@dataclass(frozen=True)
-class Run:
-    """One part of one run."""
-
-    case: str
-    family: str
-    quantity: str
-    part: str
-    method: str
-    estimator: str
-    settings: str
-    origin: str
-    seed: int
-    matvecs: float
-    seconds: float
-    true_error: float
-    reported_error: float
-    covered: float
-
-
-def measure(case: Case, method: Method, seed: int) -> list[Run]:
-    """Run a method on a case and compare its answers with the truth."""
-    meter = MeteredOperator(case)
-    start = perf_counter()
-    answers = method.run(case, meter, seed)
-    seconds = perf_counter() - start - meter.spent + meter.seconds
-    runs = []
-    for answer in answers:
-        sums = method.quantity == "sums"
-        quantity, part = (answer.part, "all") if sums else (method.quantity, answer.part)
-        estimator = method.estimator or method.name
-        about = (case.name, case.family, quantity, part, method.name, estimator, method.settings, method.origin, seed)
-        runs.append(Run(*about, meter.matvecs, seconds, *scored(case, quantity, answer)))
-    return runs
-
-
-def scored(case: Case, quantity: str, answer: Answer) -> tuple[float, float, float]:
-    """True error, reported error, and whether the interval, widened by round-off, contains the truth; nan: none reported."""
-    truth, scale = truth_of(case, quantity, answer.part)
-    as_vector = torch.as_tensor(answer.value, dtype=torch.float64)
-    low, high, error = (torch.as_tensor(x, dtype=torch.float64) for x in (answer.low, answer.high, answer.error))
-    slack = case.round_off * scale
-    inside = ((low - slack <= truth) & (truth <= high + slack)).double()
-    covered = nan if bool(low.isnan().any()) else float(inside.mean())
-    true_error = float((as_vector - truth).norm()) / scale
-    return true_error, float(error.norm()) / scale, covered
-
-
-def truth_of(case: Case, quantity: str, part: str) -> tuple[Tensor, float]:
-    """The true value and the scale of its errors."""
-    truth = case.truth
-    match quantity:
-        case "traces":
-            value, scale = truth.traces[part], truth.scales[part]
-        case "ends":
-            value, larger = getattr(truth, part), max(abs(truth.largest), abs(truth.smallest))
-            scale = abs(value) if abs(value) > case.round_off * larger else larger
-        case "diagonal":
-            assert truth.diagonal is not None
-            return truth.diagonal, float(truth.diagonal.norm())
-        case _:
-            name = "absolute_sum" if quantity == "sum of |lambda|" else quantity.replace(" ", "_")
-            value = getattr(truth, name)
-            scale = abs(value)
-    return torch.tensor(value, dtype=torch.float64), scale
-
-
 # --- precision --------------------------------------------------------------------------------------------------------
 
 
-def precision_runs(case: Case, seed: int) -> Iterator[Run]:
+def precision_runs(case: StudyCase, seed: int) -> Iterator[Run]:
     """The error of z . H z due to rounding: products and sums in either precision, against both in float64 with the same z.
 
     The error is that of the mean over PROBES vectors z, over the mean of |z| |H z|.
@@ -167,51 +99,45 @@ def quadratic_forms(operator: SymmetricOperator, Z: Tensor, sums: torch.dtype) -
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
-def run_accuracy(options: BenchOptions) -> int:
-    """Run every method on every case; print, write and draw the results; returns the exit code 0."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run every method on every case; print, write and draw the results; returns the exit code."""
+    parser = argparse.ArgumentParser("python -m notebooks.accuracy", description="Work against true error.")
+    parser.add_argument("--quantity", action="append", choices=QUANTITIES, default=[], help="study this alone")
+    parser.add_argument("--case", action="append", default=[], help="study this scene or matrix alone")
+    parser.add_argument("--scenes", type=int, default=1, help="small scenes of each kind, from a seed each")
+    parser.add_argument("--repetitions", type=int, default=15, help="what the numbers of seeds are in proportion to")
+    parser.add_argument("--out", type=Path, default=Path("runs/accuracy"), help="folder of the tables and figures")
+    options = parser.parse_args(arguments)
     console, errors = Console(), Console(stderr=True)
+    cases = chosen_cases(options.case, options.scenes)
     options.out.mkdir(parents=True, exist_ok=True)
-    runs: list[Run] = []
-    with Progress(console=errors, transient=True) as progress:
-        bar = progress.add_task("accuracy: making the cases", total=None)
-        cases = _cases(options)
-        budgets = BUDGETS if options.checkpoint is None else FEW_BUDGETS
-        peers, missing = peer_methods(budgets)
-        methods = [*own_methods(budgets), *peers]
-        jobs = [
-            (case, method, seed)
-            for case in cases
-            for method in methods
-            for seed in range(seeds_of(case, method, options.repetitions))
-            if method.applies(case) and (case.family != "checkpoint" or affordable(method))
-            if method.quantity in (options.quantity or get_args(Quantity))
-        ]
-        progress.update(bar, total=len(jobs))
-        for case, method, seed in jobs:
-            progress.update(bar, description=f"accuracy: {case.name}, {method.name}"[:60])
-            runs += measure(case, method, SEED + seed)
-            progress.advance(bar)
-        for case in cases:
-            if isinstance(case.operator, DenseOperator) and not options.quantity:
-                runs += [run for seed in range(PRECISION_SEEDS) for run in precision_runs(case, SEED + seed)]
+    peers, missing = peer_methods()
+    methods = [method for method in (*own_methods(), *peers) if method.quantity in (options.quantity or QUANTITIES)]
+    jobs = [
+        (case, method, seed)
+        for case in cases
+        for method in methods
+        if method.applies(case)
+        for seed in range(seeds_of(case, method, options.repetitions))
+    ]
+    shown = track(jobs, "accuracy", console=errors, transient=True)
+    runs = [run for case, method, seed in shown for run in measure(case, method, SEED + seed)]
+    if not options.quantity:
+        runs += [run for case in cases for seed in range(PRECISION_SEEDS) for run in precision_runs(case, SEED + seed)]
     say(*missing, style="yellow", console=console)
-    _report(pd.DataFrame(vars(run) for run in runs), options, cases, console)
+    report(pd.DataFrame(vars(run) for run in runs), options.out, {case.name: case.round_off for case in cases}, console)
     return 0
 
 
-def _cases(options: BenchOptions) -> list[Case]:
-    if options.scenes < 1:
-        raise InputError(f"expected at least 1 scene of each kind, got --scenes {options.scenes}")
-    if options.checkpoint is not None:
-        if options.case or options.scenes > 1:
-            raise InputError("expected neither --case nor --scenes beside a checkpoint, which is the only case")
-        return [checkpoint_case(options.checkpoint, options.out, options.downscale)]
-    matrices, scenes = {case.name: case for case in matrix_cases(SEED)}, splat_cases(SEED, options.scenes)
-    if strange := set(options.case) - {*matrices, *scenes}:
-        names = ", ".join(map(repr, (*scenes, *matrices)))
-        raise InputError(f"expected --case to be one of {names}, got {', '.join(map(repr, sorted(strange)))}")
-    chosen = options.case or (*scenes, *matrices)
-    return [scenes[name]() if name in scenes else matrices[name] for name in chosen]
+def chosen_cases(names: Sequence[str], scenes: int) -> list[StudyCase]:
+    """The cases of these names; all where there are none.  scenes: how many of each kind."""
+    if scenes < 1:
+        raise InputError(f"expected at least 1 scene of each kind, got --scenes {scenes}")
+    matrices, splats = {case.name: case for case in matrix_cases(SEED)}, splat_cases(SEED, scenes)
+    if strange := set(names) - {*matrices, *splats}:
+        known = ", ".join(map(repr, (*splats, *matrices)))
+        raise InputError(f"expected --case to be one of {known}, got {', '.join(map(repr, sorted(strange)))}")
+    return [splats[name]() if name in splats else matrices[name] for name in names or (*splats, *matrices)]
 
 
 def seeds_of(case: Case, method: Method, repetitions: int) -> int:
@@ -221,8 +147,8 @@ def seeds_of(case: Case, method: Method, repetitions: int) -> int:
     return max(FEWEST_SEEDS, round(share * repetitions))
 
 
-def _report(table: pd.DataFrame, options: BenchOptions, cases: Sequence[Case], console: Console) -> None:
-    floors = {case.name: case.round_off for case in cases}
+def report(table: pd.DataFrame, out: Path, floors: Mapping[str, float], console: Console) -> None:
+    """Print, write and draw.  floors: round-off of each case."""
     means = points(table, floors)
     found = ratios(table, floors)
     for against, title in TITLES.items():
@@ -232,8 +158,12 @@ def _report(table: pd.DataFrame, options: BenchOptions, cases: Sequence[Case], c
         shown = rounding.reset_index().filter(["case", *PRECISIONS])
         console.print(rich_table(shown, "what rounding adds to z.Hz, over |z| |Hz|"))
     for name, data in {"accuracy": table, "accuracy_points": means, "accuracy_ratios": found}.items():
-        write_table(data, options.out / f"{name}.csv", console)
-    say(*draw("accuracy", options.out / "accuracy_points.csv"), f"{options.out}/accuracy_*.png", console=console)
+        write_table(data, out / f"{name}.csv", console)
+    say(*draw("accuracy", out / "accuracy_points.csv"), f"{out}/accuracy_*.png", console=console)
     verdicts = [row["holds"] for row in found.to_dict("records") if row["against"] == "peer" and row["holds"]]
     counts = (f"{verdicts.count(word)} {word}" for word in ("yes", "no", "open"))
     say(f"of {len(verdicts)} that are asked for: {', '.join(counts)}", console=console)
+
+
+if __name__ == "__main__":
+    program(main)

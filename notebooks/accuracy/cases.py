@@ -1,27 +1,22 @@
 """Cases of the accuracy study: operators with known traces, spectrum and diagonal, and the cost of their products.
 
-    splats      the Hessian of a small synthetic scene as a dense matrix in float64, whose eigendecomposition is the truth.
-                Methods get the same matrix in float32; a product costs what the scene's kernels take for it.  Only
-                `exact_traces`, which needs more than products, and the comparison of precisions run on the scene itself.
-    matrices    random eigenvectors, prescribed eigenvalues
-    checkpoint  a trained scene, with a converged long run as truth (`analysis.bench.accuracy.checkpoint`)
-
-The scale of a block's trace is sum |H_ii| over the block (over all rows where the block is zero).  That of an end of the
-spectrum is its magnitude, as in the stopping rules of all methods (the larger end's, where it is zero to round-off).
+splats      the Hessian of a small synthetic scene as a dense matrix in float64, whose eigendecomposition is the truth.
+            Methods get the same matrix in float32; a product costs what the scene's kernels take for it.  Only
+            `exact_traces`, which needs more than products, and the comparison of precisions run on the scene itself.
+matrices    random eigenvectors, prescribed eigenvalues
 """
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from time import perf_counter
 
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from landscape.eigen.eigen import extreme_eigenpairs
-from landscape.eigen.pairs import EigenEnds
-from landscape.operators.operator import DenseOperator, SymmetricOperator, require_vectors
+from analysis.bench.accuracy.cases import Case, Truth
+from landscape.operators.operator import DenseOperator, SymmetricOperator
 from landscape.spectrum.density import ActiveSpace
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
@@ -34,101 +29,34 @@ SETTINGS = SyntheticSettings(60, 2, 24, 18, sh_degree=0)
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
-    """True values that estimates are compared with.  diagonal: None where not known."""
+class StudyCase(Case):
+    """A case of the study.  products: the scene's kernels by precision, None of a matrix."""
 
-    traces: Mapping[str, float]
-    scales: Mapping[str, float]
-    largest: float
-    smallest: float
-    absolute_sum: float
-    effective_rank: float
-    diagonal: Float64[Tensor, " n"] | None
-
-    @classmethod
-    def of(cls, matrix: Float64[Tensor, "n n"], blocks: Mapping[str, slice]) -> "Truth":
-        """The truth of a dense matrix."""
-        values, diagonal = torch.linalg.eigvalsh(matrix), matrix.diagonal()
-        total = float(values.abs().sum())
-        return cls(
-            traces={name: float(diagonal[rows].sum()) for name, rows in blocks.items()},
-            scales={name: float(diagonal[rows].abs().sum() or diagonal.abs().sum()) for name, rows in blocks.items()},
-            largest=float(values[-1]),
-            smallest=float(values[0]),
-            absolute_sum=total,
-            effective_rank=total**2 / float(values.square().sum()),
-            diagonal=diagonal.clone(),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """An operator with its true values.
-
-    price: seconds of a product with k vectors; None: those measured.  objective: the scene, None of a matrix.  products: the
-    scene's kernels by precision, None of a matrix.
-    """
-
-    name: str
-    family: str
-    operator: SymmetricOperator
-    truth: Truth
-    price: Callable[[int], float] | None = None
-    objective: SceneObjective | None = None
-    active: ActiveSpace | None = None
     products: Mapping[torch.dtype, SymmetricOperator] | None = None
 
-    @property
-    def round_off(self) -> float:
-        """Round-off of an estimate, relative to its scale: sqrt(rows) eps, of independent roundings in every row."""
-        return self.operator.dim**0.5 * torch.finfo(self.operator.dtype).eps
 
-    @property
-    def scene(self) -> SceneObjective:
-        """The objective, of a case that is a scene."""
-        assert self.objective is not None
-        return self.objective
-
-    @cached_property
-    def ends(self) -> EigenEnds:
-        """Both ends, by `extreme_eigenpairs` with its defaults."""
-        return extreme_eigenpairs(self.operator, torch.Generator().manual_seed(0))
-
-
-class MeteredOperator:
-    """The operator of a case, which counts its products.
-
-    matvecs: vectors applied, and other work charged.  seconds: of the products, at the case's price where it has one; spent:
-    of the products as measured.
-    """
-
-    def __init__(self, case: Case) -> None:
-        self.inner, self.price = case.operator, case.price
-        self.dim, self.blocks, self.dtype = case.operator.dim, case.operator.blocks, case.operator.dtype
-        self.matvecs, self.seconds, self.spent = 0.0, 0.0, 0.0
+class MatrixOperator(DenseOperator):
+    """A matrix whose products of blocks are quick: columns outside the rows of V that are not 0 are not read."""
 
     def apply(self, V: Tensor) -> Tensor:
-        require_vectors(V, self.dim)
-        start = perf_counter()
-        result = _product(self.inner, V)
-        spent = perf_counter() - start
-        self.matvecs += V.shape[1]
-        self.spent += spent
-        self.seconds += spent if self.price is None else self.price(V.shape[1])
-        return result
-
-    def charge(self, matvecs: float) -> None:
-        """Count other work, in units of a product with one vector."""
-        self.matvecs += matvecs
+        used = V.any(dim=1).nonzero()
+        rows = slice(int(used[0]), int(used[-1]) + 1) if len(used) else slice(0, 0)
+        return self.matrix[:, rows] @ V[rows]
 
 
-def _product(operator: SymmetricOperator, V: Tensor) -> Tensor:
-    """H V.  Of a matrix, only the columns from the first to the last row of V that is not 0: quick products of blocks."""
-    if not isinstance(operator, DenseOperator):
-        return operator.apply(V)
-    used = V.any(dim=1).nonzero()
-    rows = slice(int(used[0]), int(used[-1]) + 1) if len(used) else slice(0, 0)
-    return operator.matrix[:, rows] @ V[rows]
+def truth_of_matrix(matrix: Float64[Tensor, "n n"], blocks: Mapping[str, slice]) -> Truth:
+    """The truth of a dense matrix."""
+    values, diagonal = torch.linalg.eigvalsh(matrix), matrix.diagonal()
+    total = float(values.abs().sum())
+    return Truth(
+        traces={name: float(diagonal[rows].sum()) for name, rows in blocks.items()},
+        scales={name: float(diagonal[rows].abs().sum() or diagonal.abs().sum()) for name, rows in blocks.items()},
+        largest=float(values[-1]),
+        smallest=float(values[0]),
+        absolute_sum=total,
+        effective_rank=total**2 / float(values.square().sum()),
+        diagonal=diagonal.clone(),
+    )
 
 
 # --- random matrices --------------------------------------------------------------------------------------------------
@@ -147,21 +75,21 @@ def spectra() -> dict[str, Float64[Tensor, " n"]]:
     }
 
 
-def matrix_cases(seed: int) -> Iterator[Case]:
+def matrix_cases(seed: int) -> Iterator[StudyCase]:
     """Dense float64 matrices with these spectra."""
     for index, (name, values) in enumerate(spectra().items()):
         generator = torch.Generator().manual_seed(1000 * seed + index)
         n = len(values)
         vectors = torch.linalg.qr(torch.randn(n, n, generator=generator, dtype=torch.float64)).Q
         matrix = (vectors * values) @ vectors.T
-        operator = DenseOperator((matrix + matrix.T) / 2)
-        yield Case(name, "matrices", operator, Truth.of(operator.matrix, operator.blocks))
+        operator = MatrixOperator((matrix + matrix.T) / 2)
+        yield StudyCase(name, "matrices", operator, truth_of_matrix(operator.matrix, operator.blocks))
 
 
 # --- splats -----------------------------------------------------------------------------------------------------------
 
 
-def splat_cases(seed: int, scenes: int = 1) -> dict[str, Callable[[], Case]]:
+def splat_cases(seed: int, scenes: int = 1) -> dict[str, Callable[[], StudyCase]]:
     """Constructors of the scenes, by name: two with SSIM, far from a fit and near it; one with the pixel loss alone, whose
     traces are exact.  scenes: of each kind, from different seeds; the k-th is called NAME #k."""
     kinds = {
@@ -178,7 +106,9 @@ def splat_cases(seed: int, scenes: int = 1) -> dict[str, Callable[[], Case]]:
     return found
 
 
-def splat_case(name: str, noise: float, loss: LossSettings, seed: int, settings: SyntheticSettings = SETTINGS) -> Case:
+def splat_case(
+    name: str, noise: float, loss: LossSettings, seed: int, settings: SyntheticSettings = SETTINGS
+) -> StudyCase:
     """The synthetic scene with `noise` on every stored parameter."""
     made, generator = synthetic_scene(settings), torch.Generator().manual_seed(seed)
     flat = made.truth.flat
@@ -191,10 +121,11 @@ def splat_case(name: str, noise: float, loss: LossSettings, seed: int, settings:
     matrix = H.apply(torch.eye(H.dim, dtype=torch.float64))
     matrix = (matrix + matrix.T) / 2
     rough = SceneHessian(single)
-    operator = DenseOperator(matrix.float(), dict(H.blocks))
+    operator = MatrixOperator(matrix.float(), dict(H.blocks))
     active = ActiveSpace(rough.project, rough.rank)
     products = {torch.float32: rough, torch.float64: H}
-    return Case(name, "splats", operator, Truth.of(matrix, H.blocks), price_of(rough), single, active, products)
+    truth = truth_of_matrix(matrix, H.blocks)
+    return StudyCase(name, "splats", operator, truth, price_of(rough), single, active, products)
 
 
 def price_of(operator: SymmetricOperator) -> Callable[[int], float]:

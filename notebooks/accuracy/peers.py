@@ -19,8 +19,9 @@ from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, lobp
 from torch import Tensor
 
 from analysis.bench.accuracy.cases import Case, MeteredOperator
-from analysis.bench.accuracy.methods import BUDGETS, DENSITIES, Answer, Method, Run
+from analysis.bench.accuracy.command import DENSITIES, Answer, Method, Works
 from landscape.operators.operator import RestrictedOperator, SymmetricOperator
+from notebooks.accuracy.methods import BUDGETS
 
 PACKAGES = {
     "curvlinops": "curvlinops-for-pytorch",
@@ -52,7 +53,7 @@ def peer_methods(budgets: tuple[int, ...] = BUDGETS) -> tuple[list[Method], list
     return methods, missing
 
 
-def _method(quantity: str, name: str, settings: str, run: Run, estimator: str = "") -> Method:
+def _method(quantity: str, name: str, settings: str, run: Works, estimator: str = "") -> Method:
     """A peer's method, which runs with torch's global generator seeded; the generator's state is restored."""
 
     def seeded(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
@@ -63,7 +64,7 @@ def _method(quantity: str, name: str, settings: str, run: Run, estimator: str = 
     return Method(quantity, name, settings, seeded, "peer", estimator=estimator)
 
 
-def _by_block(trace: Callable[[SymmetricOperator], Any]) -> Run:
+def _by_block(trace: Callable[[SymmetricOperator], Any]) -> Works:
     """A run on each block; nan where a sketch is singular."""
 
     def of(operator: SymmetricOperator) -> float:

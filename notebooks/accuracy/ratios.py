@@ -1,6 +1,6 @@
-"""Summaries of an accuracy study: a point for each setting, and the defaults' work over the rivals' at equal true error.
+"""Ratios of an accuracy study: the defaults' work over the rivals' at equal true error.
 
-`analysis.bench.accuracy.command` has the definitions; `table` is its table of runs, `floors` the round-off of each case.
+`notebooks.accuracy` has the definitions; `table` is its table of runs, `floors` the round-off of each case.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,27 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from analysis.bench.accuracy.command import squares
+
 SCENES = {"traces": 0.5, "ends": 0.85}  # largest ratios that are asked for on scenes and checkpoints, by quantity
 MATRICES = 1.1  # the same on matrices, for every quantity
 DRAWS = 200  # of the bootstrap
 LIMITS = (0.025, 0.975)  # of a 95% interval
 MEANS = ("error", "needs", "rival_needs", "ratio", "seconds_ratio")  # columns averaged over scenes
 QUANTITIES = ("traces", "ends", "sum of |lambda|", "effective rank", "diagonal")
-SETTING = ["case", "family", "quantity", "origin", "method", "settings"]
-
-
-def points(table: pd.DataFrame, floors: Mapping[str, float]) -> pd.DataFrame:
-    """A line for each setting: means over seeds and parts, of errors root mean squares."""
-    table = table.assign(true_error=_squares(table, floors), reported_error=table["reported_error"].pow(2))
-    columns = ["matvecs", "seconds", "true_error", "reported_error", "covered"]
-    means = pd.DataFrame(table.groupby(SETTING, sort=False)[columns].mean()).reset_index()
-    return means.assign(true_error=means["true_error"].pow(0.5), reported_error=means["reported_error"].pow(0.5))
-
-
-def _squares(table: pd.DataFrame, floors: Mapping[str, float]) -> np.ndarray:
-    """Squared true errors, at least the squared round-off of the case; infinite where the method failed."""
-    floor = table["case"].map(lambda case: floors[case]).where(table["quantity"] != "precision", 0.0)
-    return np.maximum(table["true_error"].fillna(np.inf).to_numpy(float), floor.to_numpy(float)) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +42,7 @@ class Curve:
 def needed(errors: np.ndarray, costs: np.ndarray, goal: float) -> tuple[float, str]:
     """Work that a method needs for an error, and the sign of the ratio's bound: "" exact, "≥" need may be less, "≤" more.
 
-    A setting reaches an error if no costlier setting has a larger one (`analysis.bench.accuracy.command`).
+    A setting reaches an error if no costlier setting has a larger one (`notebooks.accuracy`).
 
     >>> errors, costs = np.array([1e-1, 1e-3]), np.array([10.0, 1000.0])
     >>> needed(errors, costs, 1e-2)[0].round(9), needed(errors, costs, 0.5), needed(errors, costs, 1e-9)
@@ -84,7 +71,7 @@ def ratios(table: pd.DataFrame, floors: Mapping[str, float]) -> pd.DataFrame:
 
     With several scenes, also a line for all of them for each quantity in SCENES (`_together`).
     """
-    table = table.assign(square=_squares(table, floors))
+    table = table.assign(square=squares(table, floors))
     rng, lines, drawn = np.random.default_rng(0), [], {}
     places = table[["case", "family", "quantity"]].drop_duplicates().itertuples(index=False, name=None)
     for case, family, quantity in places:

@@ -9,16 +9,24 @@ import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-import analysis.bench.accuracy.command as accuracy
-from analysis.bench.accuracy.cases import Case, MeteredOperator, Truth, matrix_cases, spectra, splat_case, splat_cases
-from analysis.bench.accuracy.command import Run, measure, precision_runs, truth_of
-from analysis.bench.accuracy.methods import JACOBIAN, PASS, Answer, Method, own_methods
-from analysis.bench.accuracy.peers import PACKAGES, peer_methods, scipy_methods
-from analysis.bench.accuracy.ratios import needed, points, ratios
-from analysis.bench.command import run_bench
-from analysis.bench.options import BenchOptions
+from analysis.bench.accuracy.cases import Case, MeteredOperator
+from analysis.bench.accuracy.command import JACOBIAN, PASS, Answer, Method, Run, measure, points, truth_of
 from figures import accuracy as figure
 from landscape.operators.operator import DenseOperator, SumOperator
+from notebooks.accuracy import __main__ as accuracy
+from notebooks.accuracy.__main__ import precision_runs
+from notebooks.accuracy.cases import (
+    MatrixOperator,
+    StudyCase,
+    matrix_cases,
+    spectra,
+    splat_case,
+    splat_cases,
+    truth_of_matrix,
+)
+from notebooks.accuracy.methods import own_methods
+from notebooks.accuracy.peers import PACKAGES, peer_methods, scipy_methods
+from notebooks.accuracy.ratios import needed, ratios
 from splat.losses.reference import LossSettings
 from splat.scenes.synthetic import SyntheticSettings
 
@@ -26,25 +34,25 @@ TINY = SyntheticSettings(50, 2, 10, 8, sh_degree=0)
 BLOCKS = {"a": slice(0, 24), "b": slice(24, 60)}
 
 
-def case_of(values: torch.Tensor, name: str = "case") -> Case:
+def case_of(values: torch.Tensor, name: str = "case") -> StudyCase:
     vectors = torch.linalg.qr(torch.randn(60, 60, generator=torch.Generator().manual_seed(3), dtype=torch.float64)).Q
     matrix = (vectors * values) @ vectors.T
     matrix = (matrix + matrix.T) / 2
-    return Case(name, "matrices", DenseOperator(matrix, BLOCKS), Truth.of(matrix, BLOCKS))
+    return StudyCase(name, "matrices", MatrixOperator(matrix, BLOCKS), truth_of_matrix(matrix, BLOCKS))
 
 
 @pytest.fixture(scope="module")
-def matrix() -> Case:
+def matrix() -> StudyCase:
     return case_of(torch.linspace(-1, 3, 60, dtype=torch.float64) ** 3)
 
 
 @pytest.fixture(scope="module")
-def pixels_alone() -> Case:
+def pixels_alone() -> StudyCase:
     return splat_case("tiny", 0.2, LossSettings(ssim_weight=0.0), 0, TINY)
 
 
 @pytest.fixture(scope="module")
-def with_ssim() -> Case:
+def with_ssim() -> StudyCase:
     return splat_case("tiny, SSIM", 0.2, LossSettings(), 0, TINY)
 
 
@@ -68,7 +76,7 @@ class CountingDense(DenseOperator):
 
 def test_the_truth_of_a_diagonal_matrix_is_what_its_entries_say():
     values = torch.tensor([4.0, -1.0, 3.0, 2.0], dtype=torch.float64)
-    truth = Truth.of(torch.diag(values), {"a": slice(0, 2), "b": slice(2, 4)})
+    truth = truth_of_matrix(torch.diag(values), {"a": slice(0, 2), "b": slice(2, 4)})
     assert truth.traces == {"a": 3.0, "b": 5.0} and truth.scales == {"a": 5.0, "b": 5.0}
     assert (truth.largest, truth.smallest, truth.absolute_sum) == (4.0, -1.0, 10.0)
     assert truth.effective_rank == pytest.approx(100 / 30)
@@ -232,7 +240,7 @@ def test_an_absent_peer_is_named_and_the_others_run(module, monkeypatch):
             raise ImportError(f"No module named {name!r}")
         return real(name, *rest)
 
-    monkeypatch.setattr("analysis.bench.accuracy.peers.importlib.import_module", without)
+    monkeypatch.setattr("notebooks.accuracy.peers.importlib.import_module", without)
     methods, missing = peer_methods()
     sentence = next(text for text in missing if text.startswith(PACKAGES[module]))
     assert "pip install" in sentence and any(m.name.startswith("SciPy") for m in methods)
@@ -363,16 +371,14 @@ def test_a_setting_counts_with_the_largest_error_of_the_costlier_ones():
 
 @pytest.fixture
 def small(monkeypatch, matrix):
-    monkeypatch.setattr(accuracy, "_cases", lambda options: [matrix])
+    monkeypatch.setattr(accuracy, "chosen_cases", lambda names, scenes: [matrix])
     chosen = {"chosen by its probes", "Hutch++", "Lanczos, both ends"}
-    monkeypatch.setattr(accuracy, "own_methods", lambda budgets: (m for m in own_methods(budgets) if m.name in chosen))
-    monkeypatch.setattr(
-        accuracy, "peer_methods", lambda budgets: (list(scipy_methods()), ["curvlinops is left out (why)"])
-    )
+    monkeypatch.setattr(accuracy, "own_methods", lambda: (m for m in own_methods() if m.name in chosen))
+    monkeypatch.setattr(accuracy, "peer_methods", lambda: (list(scipy_methods()), ["curvlinops is left out (why)"]))
 
 
 def test_the_command_prints_writes_and_draws(small, tmp_path, capsys):
-    assert run_bench(BenchOptions(subject="accuracy", out=tmp_path, repetitions=2)) == 0
+    assert accuracy.main(["--out", str(tmp_path), "--repetitions", "2"]) == 0
     runs = pd.read_csv(tmp_path / "accuracy.csv")
     assert list(runs.columns) == list(Run.__annotations__)
     assert set(runs["quantity"]) == {"traces", "ends", "diagonal", "precision"}
@@ -393,18 +399,13 @@ def test_a_study_of_one_quantity_and_one_case_leaves_the_others_out(tmp_path, mo
         return [run]
 
     monkeypatch.setattr(accuracy, "measure", note)
-    monkeypatch.setattr(accuracy, "_report", lambda *_: None)
-    options = BenchOptions(subject="accuracy", out=tmp_path, repetitions=1, quantity=("ends",), case=("flat",))
-    assert run_bench(options) == 0 and met == {("flat", "ends")}
+    monkeypatch.setattr(accuracy, "report", lambda *_: None)
+    words = ["--out", str(tmp_path), "--repetitions", "1", "--quantity", "ends", "--case", "flat"]
+    assert accuracy.main(words) == 0 and met == {("flat", "ends")}
     with pytest.raises(ValueError, match=r"expected --case to be one of 'far from a fit', .*'flat', got 'round'"):
-        run_bench(BenchOptions(subject="accuracy", out=tmp_path, case=("round",)))
-    for other in (None, "stress"):
-        with pytest.raises(ValueError, match="landscape bench accuracy"):
-            run_bench(BenchOptions(subject=other, out=tmp_path, quantity=("ends",)))
+        accuracy.main(["--out", str(tmp_path), "--case", "round"])
     with pytest.raises(ValueError, match="at least 1 scene"):
-        run_bench(BenchOptions(subject="accuracy", out=tmp_path, scenes=0))
-    with pytest.raises(ValueError, match="which is the only case"):
-        run_bench(BenchOptions(subject="accuracy", out=tmp_path, checkpoint=tmp_path / "x.pt", scenes=2))
+        accuracy.main(["--out", str(tmp_path), "--scenes", "0"])
 
 
 def test_scenes_of_a_kind_are_different_worlds():
@@ -413,13 +414,6 @@ def test_scenes_of_a_kind_are_different_worlds():
     one, other = (recipes[name].args for name in ("near a fit", "near a fit #2"))
     assert one[:3] == ("near a fit", 0.02, LossSettings()) and other[1:3] == one[1:3]
     assert one[3] != other[3] and one[4].seed != other[4].seed
-
-
-def test_a_checkpoint_belongs_to_accuracy_alone(tmp_path):
-    with pytest.raises(ValueError, match="only accuracy"):
-        run_bench(BenchOptions(subject="stress", checkpoint=tmp_path / "x.pt", out=tmp_path))
-    with pytest.raises(FileNotFoundError, match="expected a checkpoint"):
-        run_bench(BenchOptions(subject="accuracy", checkpoint=tmp_path / "x.pt", out=tmp_path))
 
 
 def test_the_figure_shows_every_method_and_the_default():

@@ -1,24 +1,32 @@
-"""A trained scene as a case of the accuracy study.  Its truth is a long run, kept in OUT/truth.json:
+"""Operators whose true numbers are known, and a trained scene as one.  Its truth is a long run, kept in OUT/truth.json:
 
     traces    `exact_traces` of SAMPLES samples
     ends      Lanczos to a residual of FINE
     sums      quadrature with STARTS x STEPS products
 
-The file belongs to one checkpoint at one size of its pictures; for another it is computed again.  The truth of the sums is
-known to half its brackets, a few percent; estimates that are more accurate cannot be compared.  There is no truth of the
-diagonal, which would take a product for every row.
+The file belongs to one checkpoint at one size of its pictures.  The truth of the sums is known to half its brackets, a few
+percent; that of the diagonal, which would take a product for every row, is not.
+
+The scale of a block's trace is sum |H_ii| over the block (over all rows where the block is zero).  That of an end of the
+spectrum is its magnitude, as in the stopping rules of all methods (the larger end's, where it is zero to round-off).
 """
 
 import hashlib
 import json
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
+from time import perf_counter
 
 import torch
+from jaxtyping import Float64
+from torch import Tensor
 
-from analysis.bench.accuracy.cases import Case, Truth
 from analysis.bench.workloads import workload_of
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
+from landscape.eigen.pairs import EigenEnds
+from landscape.operators.operator import SymmetricOperator, require_vectors
 from landscape.spectrum.absolute_sum import absolute_sum
 from landscape.spectrum.anisotropy import effective_rank
 from landscape.spectrum.density import ActiveSpace, spectral_density
@@ -31,6 +39,79 @@ from splat.training.checkpoint import write_atomically
 SAMPLES, FINE, MOST = 128, 1e-6, 250  # MOST: products of the search for the ends
 STARTS, STEPS = 6, 24
 TRUTH = "truth.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """True values that estimates are compared with.  diagonal: None where not known."""
+
+    traces: Mapping[str, float]
+    scales: Mapping[str, float]
+    largest: float
+    smallest: float
+    absolute_sum: float
+    effective_rank: float
+    diagonal: Float64[Tensor, " n"] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """An operator with its true values.
+
+    family: of its kind, for which some methods are.  price: seconds of a product with k vectors; None: those measured.
+    objective: the scene, None of a matrix.
+    """
+
+    name: str
+    family: str
+    operator: SymmetricOperator
+    truth: Truth
+    price: Callable[[int], float] | None = None
+    objective: SceneObjective | None = None
+    active: ActiveSpace | None = None
+
+    @property
+    def round_off(self) -> float:
+        """Round-off of an estimate, relative to its scale: sqrt(rows) eps, of independent roundings in every row."""
+        return self.operator.dim**0.5 * torch.finfo(self.operator.dtype).eps
+
+    @property
+    def scene(self) -> SceneObjective:
+        """The objective, of a case that is a scene."""
+        assert self.objective is not None
+        return self.objective
+
+    @cached_property
+    def ends(self) -> EigenEnds:
+        """Both ends, by `extreme_eigenpairs` with its defaults."""
+        return extreme_eigenpairs(self.operator, torch.Generator().manual_seed(0))
+
+
+class MeteredOperator:
+    """The operator of a case, which counts its products.
+
+    matvecs: vectors applied, and other work charged.  seconds: of the products, at the case's price where it has one; spent:
+    of the products as measured.
+    """
+
+    def __init__(self, case: Case) -> None:
+        self.inner, self.price = case.operator, case.price
+        self.dim, self.blocks, self.dtype = case.operator.dim, case.operator.blocks, case.operator.dtype
+        self.matvecs, self.seconds, self.spent = 0.0, 0.0, 0.0
+
+    def apply(self, V: Tensor) -> Tensor:
+        require_vectors(V, self.dim)
+        start = perf_counter()
+        result = self.inner.apply(V)
+        spent = perf_counter() - start
+        self.matvecs += V.shape[1]
+        self.spent += spent
+        self.seconds += spent if self.price is None else self.price(V.shape[1])
+        return result
+
+    def charge(self, matvecs: float) -> None:
+        """Count other work, in units of a product with one vector."""
+        self.matvecs += matvecs
 
 
 def checkpoint_case(path: Path, out: Path, downscale: float = 1.0) -> Case:

@@ -1,30 +1,21 @@
 """The benchmarks measure what they say, on sizes too small to say anything about speed."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from analysis.bench.command import run_bench
 from analysis.bench.options import BenchOptions
-from analysis.bench.speed import meters
-from analysis.bench.speed.meters import HostMeter
-from analysis.bench.speed.reference import reference_cost
-from analysis.bench.speed.scene import SCALED, ViewBench
-from analysis.bench.speed.timing import Timing, interleaved
+from analysis.bench.scene import ViewBench
+from analysis.bench.timing import Meter, Timing, interleaved
 from analysis.bench.workloads import Size, synthetic_workload
 from analysis.commands.cli import main
-from figures import bench as figure
-from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import SceneObjective
-from splat.render.formulas import SPLAT
+from splat.raster.formulas import SPLAT
 
-ROOT = Path(__file__).parents[3]
 TINY = Size(60, 40, 24)
 
 
@@ -54,16 +45,14 @@ def test_what_is_no_size_is_refused(text):
 
 def test_calls_are_timed_in_turns_after_one_that_is_not():
     order = []
-    rounds = []
-    times = interleaved({name: lambda name=name: order.append(name) for name in "ab"}, 2, lambda: rounds.append(1))
-    assert "".join(order) == "ab" + "ab" + "ba" and len(rounds) == 2
+    times = interleaved({name: lambda name=name: order.append(name) for name in "ab"}, 2)
+    assert "".join(order) == "ab" + "ab" + "ba"
     assert all(len(time.seconds) == 2 and 0 <= time.minimum <= time.median for time in times.values())
 
 
-def test_times_add_round_by_round():
-    both = Timing((1.0, 4.0, 2.0)) + Timing((5.0, 1.0, 2.0))
-    assert both.seconds == (6.0, 5.0, 4.0) and (both.minimum, both.median) == (4.0, 5.0)
-    assert (both / 2).seconds == (3.0, 2.5, 2.0)
+def test_times_have_a_minimum_and_a_median_and_equal_parts():
+    time = Timing((6.0, 5.0, 4.0))
+    assert (time.minimum, time.median) == (4.0, 5.0) and (time / 2).seconds == (3.0, 2.5, 2.0)
 
 
 def test_the_timed_gradients_are_the_gradient_of_the_view(bench):
@@ -74,111 +63,47 @@ def test_the_timed_gradients_are_the_gradient_of_the_view(bench):
         assert (gradient - expected).norm() < 16 * torch.finfo(torch.float32).eps * expected.norm()
 
 
-def test_the_stages_of_a_scene_run_and_leave_the_view_as_it_was(bench):
+def test_the_calls_of_a_scene_run_and_leave_the_view_as_it_was(bench):
     before = bench.gradient()
-    for call in {**bench.stages(), **bench.product(4), **bench.wholes()}.values():
+    for call in bench.calls().values():
         call()
     np.testing.assert_array_equal(bench.gradient(), before)
-    np.testing.assert_array_equal(bench.adjoint.moments, bench.raster.backward(bench.cotangent).moments)
-
-
-def test_pairs_are_the_pixels_of_the_rows_that_are_passed(bench):
-    lists, _ = bench.raster.reached
-    count = sum((int(r) >> 8 & 255) - (int(r) & 255) + 1 for r in lists.rows)
-    assert bench.linearized.intersections == lists.rows.size > 0
-    assert bench.raster.pairs == count * lanes_of(np.float32)
 
 
 def test_memory_is_that_of_the_arrays(bench):
     view = bench.linearized
-    shared = 4 * 3 * view._raster.frame.size  # the image, which the loss holds as a view of the raster's planes
-    assert view.bytes - shared <= bench.kept() <= 1.1 * view.bytes
     for K in (1, 8):  # the sums of the intersections, the planes of the tangents
         least = 4 * K * (SPLAT * view.intersections + 5 * view._raster.frame.size)
         blocks = 4 * 4 * K * view.gradient.numel()  # the argument, the result and their copies
         objects = 64 * 1024  # Python's own
-        assert least <= bench.workspace(K, HostMeter()) <= view.workspace(K) + blocks + objects
+        assert least <= bench.workspace(K, Meter()) <= view.workspace(K) + blocks + objects
 
 
-def test_the_reference_is_measured_in_a_process_of_its_own():
-    cost = reference_cost(synthetic_workload(TINY))
-    # the tiles' alphas alone: each of 60 Gaussians touches a tile of 16 x 16 pixels at least
-    assert cost.gradient > 0 and cost.product > 0 and cost.peak > 4 * 60 * 16 * 16
-
-
-def test_thinning_and_resizing_give_workloads_of_that_size():
+def test_resizing_gives_a_workload_of_that_size():
     workload = synthetic_workload(TINY)
-    assert len(workload.thinned(20).gaussians) == 20
     assert workload.resized(0.5).pixels == 20 * 12
     assert workload.resized(0.5).views[0].camera.fx == workload.views[0].camera.fx / 2
 
 
-def test_ceilings_are_of_all_multiply_adds_and_of_bytes_read_and_written(monkeypatch):
-    class Clock(HostMeter):
-        def seconds(self, call):
-            call()
-            return 0.5
-
-    monkeypatch.setitem(meters.ROWS, "cpu", 16)
-    assert meters.fma_peak(Clock()) == 16**3 / 0.5
-    assert meters.bandwidth(Clock(), 1 << 10) == 2 * (1 << 10) / 0.5
-
-
-def test_a_bench_records_times_bounds_and_a_figure(recorded):
-    assert sorted(p.name for p in recorded.iterdir()) == ["bench.csv", "bench.png", "bounds.csv"]
+def test_a_bench_records_times_and_the_bounds_that_are_asked(recorded):
+    assert sorted(p.name for p in recorded.iterdir()) == ["bench.csv", "bounds.csv"]
     table, bounds = pd.read_csv(recorded / "bench.csv"), pd.read_csv(recorded / "bounds.csv")
     assert (table[["minimum_ms", "median_ms"]].to_numpy() > 0).all()
-    for study in ("gaussians", "pixels", "views", "threads"):
-        lines = table[table["study"] == study]
-        points = list(zip(lines["stage"], lines[study]))
-        assert {stage for stage, _ in points} == set(SCALED) and len(set(points)) == len(points)
-    assert sorted(table.loc[table["study"] == "views", "views"].unique()) == [1, 2, 4]
-    stages = table[table["study"] == "stages"]
-    assert set(table["device"]) == {"cpu"} and not {"gsplat", "gradient, atomic"} & set(stages["stage"])
-    time, ratio = dict(zip(stages["stage"], stages["minimum_ms"])), dict(zip(bounds["what"], bounds["measured"]))
+    time, ratio = dict(zip(table["stage"], table["minimum_ms"])), dict(zip(bounds["what"], bounds["measured"]))
+    assert {"gradient", "linearize", "H v 1", "H v 8", "block diagonal", "exact blocks"} <= time.keys()
     assert ratio["H v 4 / gradient"] == pytest.approx(time["H v 4"] / time["gradient"])
     limit = bounds["asked"].str.removeprefix("≤ ").astype(float)
     assert (bounds["holds"] == (bounds["measured"] <= limit)).all()
 
 
-def test_the_figure_fits_its_column_and_shows_the_recorded_times(recorded):
-    table = pd.read_csv(recorded / "bench.csv")
-    drawn = figure.draw(table)
-    drawn.set_dpi(100)
-    FigureCanvasAgg(drawn).draw()
-    axes = next(axes for axes in drawn.axes if axes.get_xlabel() == "pixels")
-    line = next(line for line in axes.lines if line.get_label() == "H v, K = 4, each")
-    lines = table[(table["study"] == "pixels") & (table["stage"] == "H v 4")]
-    points = sorted(zip(lines["pixels"], lines["minimum_ms"]))
-    np.testing.assert_array_equal(np.asarray(line.get_xydata()), points)
-    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-    assert [text.get_text() for text in drawn.legends[0].get_texts()][-1] == "in proportion"
-
-
-def test_the_figure_from_the_command_line_and_its_refusal(recorded, tmp_path):
-    def run(path):
-        return subprocess.run(
-            [sys.executable, "-m", "figures.bench", str(path)], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-
-    (recorded / "bench.png").unlink()
-    assert run(recorded / "bench.csv").returncode == 0 and (recorded / "bench.png").stat().st_size > 1000
-    (tmp_path / "bench.csv").write_text("a,b\n1,2\n")
-    refused = run(tmp_path / "bench.csv")
-    assert refused.returncode == 2 and refused.stderr.startswith("expected bench.csv")
-
-
-def test_the_kernels_are_recorded_with_their_ratios(tmp_path, capsys):
-    arguments = ["bench", "kernels", "--sizes", str(TINY), "--repetitions", "1", "--out", str(tmp_path / "out")]
-    assert main(arguments) == 0
-    table, bounds = (pd.read_csv(tmp_path / "out" / name) for name in ("kernels.csv", "kernel_bounds.csv"))
-    time = dict(zip(table["stage"], table["minimum_ms"]))
-    ratio = dict(zip(bounds["ratio"], bounds["of_minima"]))
-    product, gradient = time["H u 4"], time["gradient, compositing"]
-    assert product == pytest.approx(time["J u 4"] + time["tangent of backward 4"])
-    assert gradient == pytest.approx(time["forward"] + time["backward + reduce"])
-    assert ratio["H u 4 / gradient, compositing"] == pytest.approx(product / gradient)
-    assert str(TINY) in capsys.readouterr().out
+def test_bounds_are_printed_where_they_are_asked_for_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(
+        "analysis.bench.command.interleaved", lambda calls, *_, **__: dict.fromkeys(calls, Timing((1.0,)))
+    )
+    for more, printed in (((), False), (("--bounds",), True)):
+        assert main(["bench", "--sizes", str(TINY), "--device", "cpu", "--out", str(tmp_path), *more]) == 0
+        said = capsys.readouterr().out
+        assert ("H v 1 / gradient" in said) == printed and "H v 4" in said and "MB more for a product" in said
 
 
 def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
@@ -203,8 +128,11 @@ def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
         (["--sizes", "many"], "GAUSSIANS@WIDTHxHEIGHT"),
         (["nowhere"], "nowhere"),
         (["--downscale", "2"], "--downscale with a scene's folder"),
-        (["kernels", "--images", "images_4"], "--images and --downscale with a scene's folder"),
-        (["kernels", "--device", "cuda"], "which measures the CPU's kernels; leave out --device"),
+        (["--images", "images_4"], "--images with a scene's folder"),
+        (["stress", "--device", "cuda"], "leave out --device"),
+        (["accuracy"], "expected bench accuracy RUN"),
+        (["stress", "run/checkpoint.pt"], "expected bench accuracy RUN"),
+        (["accuracy", "nowhere/checkpoint.pt"], "expected a checkpoint"),
     ],
 )
 def test_bad_input_gets_one_sentence(tmp_path, capsys, arguments, message):

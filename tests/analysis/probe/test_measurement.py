@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from analysis.bench.accuracy.cases import splat_cases
 from analysis.console.stages import Stages, Work
 from analysis.probe import measurement
 from analysis.probe.measurement import measure
@@ -13,6 +12,7 @@ from analysis.probe.plan import plan_of
 from analysis.probe.settings import ProbeSettings
 from landscape import EigenSettings, TraceSettings, extreme_eigenpairs
 from landscape.eigen.power import power_iteration
+from notebooks.accuracy.cases import splat_cases
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.linearize import LinearizedView

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from analysis.bench.precision import precision, same_decisions
 from analysis.bench.workloads import Size, Workload, synthetic_workload
 from splat.losses.cpu.loss import CpuViewLoss
 from splat.model.settings import RenderSettings
 from splat.projection.cpu import project_arrays
 from splat.projection.formulas import lens_of
+from tests.splat.curvature.precision import precision, same_decisions
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +60,9 @@ def test_gaussians_that_change_places_in_the_order_are_told_apart(workload):
 
 
 def test_an_error_in_single_precision_alone_is_seen(workload, monkeypatch):
-    def spoiled(image, loss, dtype):
-        return CpuViewLoss(image * (1.01 if dtype == torch.float32 else 1.0), loss, dtype)
+    def spoiled(image, loss, like):
+        return CpuViewLoss(image * (1.01 if like.dtype == torch.float32 else 1.0), loss, like.dtype)
 
-    monkeypatch.setattr("splat.render.backend.CpuViewLoss", spoiled)
+    monkeypatch.setattr("tests.splat.curvature.precision.loss_against", spoiled)
     lines = {line.quantity: line.error for line in precision(workload) if line.decisions == "held equal"}
     assert lines["image"] < 1e-5 < 1e-4 < lines["gradient"]

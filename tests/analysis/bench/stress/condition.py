@@ -7,7 +7,7 @@ signs; autograd passes the adjoints through the same factors:
     K(Q) = sqrt(mean |Q(d) - Q|^2) / d sqrt(DRAWS / chi^2)        over DRAWS draws of signs, d = STEP
 
 chi^2: the 1% quantile with DRAWS degrees of freedom, for the sampling error of the mean where few signs dominate it, as for
-needles.  The order of the splats is fixed; no pixel is near a threshold (`analysis.bench.stress.cases`).
+needles.  The order of the splats is fixed; no pixel is near a threshold (`analysis.bench.stress`).
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from analysis.bench.stress.cases import BACKGROUND, Case
+from analysis.bench.stress import BACKGROUND, Case
 from splat.losses.reference import C1, C2, LossSettings, blur, pixel_loss
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import Splats, project

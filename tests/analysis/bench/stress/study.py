@@ -1,10 +1,8 @@
-"""The stress study: image, first and second derivatives at the limits of the renderer, against float64 and stated bounds.
-
-OUT/stress.csv   a line for each case, quantity, attribute and precision: error, bound, norm of the truth, verdict
+"""Image, first and second derivatives at the limits of the renderer, against the specification in float64 and stated bounds.
 
 The truth is the plain torch specification in float64, differentiated by autograd (H as a dense matrix).  The bound of a
 quantity Q follows from its condition K(Q), the change of Q by relative changes of all intermediate numbers
-(`analysis.bench.stress.condition`):
+(`condition`):
 
     bound = (4 sqrt(k / 3) (u + u64) + e) K(Q)        k = 8 + 3 n roundings between two stages, u half an eps
 
@@ -26,39 +24,27 @@ C is the cancellation in sums of moments (`cancellation`).  Blocks and traces ar
 """
 
 from dataclasses import dataclass
-from math import nan, sqrt
+from math import sqrt
 
-import pandas as pd
 import torch
 from jaxtyping import Float64
-from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
-from analysis.bench.options import BenchOptions
-from analysis.bench.stress.cases import BACKGROUND, Case, Refusal, cases, refusals
-from analysis.bench.stress.condition import Condition, cancellation, specified
-from analysis.bench.tables import rich_table, write_table
-from analysis.console.plain import say
+from analysis.bench.stress import PIXELS_ALONE, WITH_SSIM, Case, objective_of
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from splat.backend.cpu.simd import EXP2_ERROR
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
-from splat.losses.reference import LossSettings
-from splat.scenes.view import View
+from tests.analysis.bench.stress.condition import Condition, cancellation, specified
 
-# L2: in autograd's derivative of the others terms of 1 / eps^2 cancel, and the specification would lose their digits
-WITH_SSIM, PIXELS_ALONE = LossSettings("l2"), LossSettings("l2", ssim_weight=0.0)
-SEED = 0
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
-GOOD = ("inside", "refused")  # verdicts
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One comparison.  error, bound and size (of the truth): norms; message: the error that an input raised."""
+    """One comparison.  error, bound and size (of the truth): norms."""
 
     case: str
     quantity: str
@@ -67,12 +53,10 @@ class Finding:
     error: float
     bound: float
     size: float
-    verdict: str
-    message: str = ""
 
     @property
     def holds(self) -> bool:
-        return self.verdict in GOOD
+        return self.error <= self.bound  # nan does not
 
 
 # --- the kernels ------------------------------------------------------------------------------------------------------
@@ -87,11 +71,7 @@ class Scene:
 
     @classmethod
     def of(cls, case: Case, dtype: torch.dtype) -> "Scene":
-        def objective(loss: LossSettings) -> SceneObjective:
-            view = View(case.name, case.camera, case.target.to(dtype))
-            return SceneObjective(case.gaussians.to(dtype), [view], loss, BACKGROUND, case.settings)
-
-        return cls(objective(WITH_SSIM), objective(PIXELS_ALONE))
+        return cls(objective_of(case, WITH_SSIM, dtype), objective_of(case, PIXELS_ALONE, dtype))
 
     def gaussian_blocks(self) -> dict[str, Tensor]:
         """The diagonal blocks of every Gaussian, by attribute, (n, d, d); of SH the diagonal."""
@@ -149,8 +129,7 @@ class Study:
 
     def record(self, quantity: str, attribute: str, precision: str, got: Tensor, truth: Tensor, bound: float) -> None:
         error, size = float((got - truth).norm()), float(truth.norm())
-        verdict = "inside" if error <= bound else "outside"  # nan is outside
-        self.findings.append(Finding(self.case.name, quantity, attribute, precision, error, bound, size, verdict))
+        self.findings.append(Finding(self.case.name, quantity, attribute, precision, error, bound, size))
 
     def run(self) -> list[Finding]:
         self.with_ssim()
@@ -229,46 +208,3 @@ class Study:
         q = self.point.quats
         result["quats"] = result["quats"] - torch.einsum("ni,nij,nj->", q, blocks["quats"], q)
         return {**result, "sh": blocks["sh"].sum()}
-
-
-def refused(refusal: Refusal) -> Finding:
-    """Whether a float32 input raises the error that it must."""
-    case = next(cases(SEED))
-    view, message = View("", case.camera, case.target), "no error"
-    try:
-        SceneObjective(refusal.gaussians.to(torch.float32), [view], WITH_SSIM, BACKGROUND, case.settings)
-    except ValueError as error:
-        message = str(error)
-    verdict = "refused" if all(word in message for word in refusal.words) else "not refused"
-    return Finding(refusal.name, "a clear error", "", "float32", nan, nan, nan, verdict, message)
-
-
-# --- the command ------------------------------------------------------------------------------------------------------
-
-
-def run_stress(options: BenchOptions) -> int:
-    """Run every case, print the worst of each, write OUT/stress.csv; returns 1 if any bound is exceeded, else 0."""
-    console, errors = Console(), Console(stderr=True)
-    findings: list[Finding] = []
-    todo = list(cases(SEED))
-    for number, case in enumerate(track(todo, "stress (first compiling)", console=errors, transient=True), 1):
-        findings += Study(case, SEED).run()
-        if not errors.is_terminal:  # where no progress bar is drawn
-            say(f"{number} of {len(todo)}: {case.name}", console=errors)
-    findings += [refused(refusal) for refusal in refusals(SEED)]
-    table = pd.DataFrame(vars(finding) for finding in findings)
-    options.out.mkdir(parents=True, exist_ok=True)
-    console.print(rich_table(worst(table), "nearest to its bound"))
-    missed = [finding for finding in findings if not finding.holds]
-    say(f"{len(findings)} comparisons, {len(missed)} outside their bounds", console=console)
-    write_table(table, options.out / "stress.csv", console)
-    return 1 if missed else 0
-
-
-def worst(table: pd.DataFrame) -> pd.DataFrame:
-    """The quantity nearest to its bound of each case and precision, and every one that exceeds it."""
-    share = (table["error"] / table["bound"]).fillna(0.0)
-    nearest = share.groupby([table["case"], table["precision"]]).transform("idxmax") == table.index
-    what = (table["quantity"] + " " + table["attribute"]).str.strip()
-    shown = pd.DataFrame(table.assign(quantity=what, truth=table["size"])[nearest | ~table["verdict"].isin(GOOD)])
-    return shown.filter(["case", "quantity", "precision", "error", "bound", "truth", "verdict"])

@@ -1,14 +1,17 @@
-"""Times that can be compared on a machine that others use too.
+"""Times that can be compared on a machine that others use too, and the memory of a call.
 
 Calls to compare are timed in turns, so that what disturbs one disturbs all; each round runs them in the opposite order of
 the last.  The minimum is the cost on a quiet machine; the median says what to expect, and how quiet the machine was.
 """
 
 import time
+import tracemalloc
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from statistics import median
 from typing import TypeVar
+
+import torch
 
 Name = TypeVar("Name", bound=Hashable)
 PAUSE = 0.002  # seconds before every call: threads that spin after their work (OpenMP's) have gone to sleep
@@ -28,10 +31,6 @@ class Timing:
     def median(self) -> float:
         return median(self.seconds)
 
-    def __add__(self, other: "Timing") -> "Timing":
-        """Time of both calls, one after the other: round by round."""
-        return Timing(tuple(a + b for a, b in zip(self.seconds, other.seconds, strict=True)))
-
     def __truediv__(self, count: float) -> "Timing":
         """Time of one of `count` equal parts."""
         return Timing(tuple(second / count for second in self.seconds))
@@ -48,7 +47,6 @@ def wall_clock(call: Callable[[], object]) -> float:
 def interleaved(
     calls: Mapping[Name, Callable[[], object]],
     repetitions: int,
-    on_round: Callable[[], None] = lambda: None,
     clock: Callable[[Callable[[], object]], float] = wall_clock,
 ) -> dict[Name, Timing]:
     """Time every call `repetitions` times, in turns, after one call each that is not timed (it may compile)."""
@@ -59,13 +57,50 @@ def interleaved(
     for turn in range(repetitions):
         for name in names if turn % 2 == 0 else reversed(names):
             seconds[name].append(clock(calls[name]))
-        on_round()
     return {name: Timing(tuple(times)) for name, times in seconds.items()}
 
 
-def time_lines(about: Mapping[str, object], times: Mapping[str, Timing]) -> list[dict]:
-    """A table's lines, one a stage: what is said of all of them, and the minimum and median of its times, ms."""
-    return [
-        {**about, "stage": name, "minimum_ms": 1e3 * time.minimum, "median_ms": 1e3 * time.median}
-        for name, time in times.items()
-    ]
+class Meter:
+    """Wall clock, and memory of NumPy's arrays: the most that a call allocates when it is made again."""
+
+    device = torch.device("cpu")
+
+    def seconds(self, call: Callable[[], object]) -> float:
+        return wall_clock(call)
+
+    def allocated(self, call: Callable[[], object]) -> int:
+        call()
+        tracemalloc.start()
+        call()
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+
+class GpuMeter(Meter):
+    """Time between two CUDA events around a call's launches, once the device is idle; memory of torch's allocator."""
+
+    def __init__(self, device: torch.device):
+        self.device = device
+
+    def seconds(self, call: Callable[[], object]) -> float:
+        with torch.cuda.device(self.device):
+            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            torch.cuda.synchronize()
+            start.record()
+            call()
+            end.record()
+            end.synchronize()
+            return start.elapsed_time(end) / 1e3
+
+    def allocated(self, call: Callable[[], object]) -> int:
+        call()
+        torch.cuda.synchronize(self.device)
+        torch.cuda.reset_peak_memory_stats(self.device)
+        before = torch.cuda.memory_allocated(self.device)
+        call()
+        return torch.cuda.max_memory_allocated(self.device) - before
+
+
+def meter_of(device: torch.device) -> Meter:
+    return Meter() if device.type == "cpu" else GpuMeter(device)
