@@ -6,14 +6,14 @@ VALUE   a plain value, or text that is read by the setting's type: a number, tru
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, fields, is_dataclass, replace
+from difflib import SequenceMatcher
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from landscape.errors import InputError, did_you_mean
-from splat.model.typed import leaves
+from splat.model.typed import leaves, typed
 from splat.training.methods.methods import METHODS
 from splat.training.state import MethodSettings, TrainConfig
 
@@ -50,7 +50,7 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
 
 
 def _unknown(key: str, config: TrainConfig) -> str:
-    """Sentence for a key that is no setting: with the one that was meant, of whatever method, else with all that there are."""
+    """Sentence for a key that is no setting: with the one that was meant, of whatever method, else with the nearest."""
     common, own, method = _names(config), _names(config.method), config.method.name
     words = f"expected a setting of the training or of the method {method}, got {key!r}"
     if key in LABELS:
@@ -63,7 +63,18 @@ def _unknown(key: str, config: TrainConfig) -> str:
     for name, settings in others.items():
         if meant := did_you_mean(key, settings):
             return f"{words}{meant.removesuffix('?')} of the method {name}?"
-    return f"{words} (of the training: {', '.join(common)}; of {method}: {', '.join(own) or 'none'})"
+    if meant := did_you_mean(key, METHODS):
+        return words + meant.replace("mean ", "mean --method ")
+    return f"{words}; the nearest are {', '.join(_nearest(key, [*common, *own]))}"
+
+
+def _nearest(key: str, names: Sequence[str]) -> list[str]:
+    """Three names of settings, by the likeness of the last part or of the whole."""
+
+    def likeness(name: str) -> float:
+        return max(SequenceMatcher(None, key, part).ratio() for part in (name, name.rpartition(".")[2]))
+
+    return sorted(names, key=likeness, reverse=True)[:3]
 
 
 def _names(settings: TrainConfig | MethodSettings) -> list[str]:
@@ -92,56 +103,17 @@ def _changed(settings: T, path: list[str], value: Any, key: str) -> T:
 
 
 def read_value(value: Any, hint: Any, key: str) -> Any:
-    """A value of a setting's type."""
-    kind, options = get_origin(hint), get_args(hint)
-    if kind in (Union, UnionType):
-        if value is None or value == "none":
-            return _require(NoneType in options, None, hint, value, key)
-        for option in (option for option in options if option is not NoneType):
-            with suppress(InputError):
-                return read_value(value, option, key)
-        return _require(False, None, hint, value, key)
-    if kind is Literal:
-        found = [option for option in options if str(option) == str(value)]
-        return _require(bool(found), next(iter(found), None), hint, value, key)
-    if kind is tuple:
-        items = [item.strip() for item in value.split(",") if item.strip()] if isinstance(value, str) else value
-        _require(isinstance(items, list | tuple), None, hint, value, key)
-        repeated = options[1:] == (Ellipsis,)
-        _require(repeated or len(items) == len(options), None, hint, value, key)
-        return tuple(read_value(item, options[0] if repeated else options[i], key) for i, item in enumerate(items))
-    if hint is bool:
-        known = {"true": True, "false": False}
-        word = str(value).lower()
-        return _require(word in known, known.get(word), hint, value, key)
-    _require(not isinstance(value, bool), None, hint, value, key)
+    """A value of a setting's type, from a plain one or from text."""
+    if not isinstance(value, str):
+        return typed(hint, value, key)
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    if value == "none" and NoneType in kinds:
+        return None
+    if Path in kinds:
+        return Path(value)
+    listed = any(get_origin(kind) is tuple for kind in kinds)
+    items = [item.strip() for item in value.split(",") if item.strip()]
     try:
-        read = hint(value)
-    except (TypeError, ValueError, OverflowError):
-        read = None
-    # int(0.5) is 0, which nobody asked for
-    return _require(read is not None and (isinstance(value, str) or read == value), read, hint, value, key)
-
-
-def _require(good: bool, read: Any, hint: Any, value: Any, key: str) -> Any:
-    if not good:
-        raise InputError(f"expected {_words(hint)} for {key}, got {value!r}")
-    return read
-
-
-def _words(hint: Any) -> str:
-    kind, options = get_origin(hint), get_args(hint)
-    if kind is Literal:
-        return " or ".join(map(str, options))
-    if kind is tuple:
-        return f"a list of {_words(options[0])}"
-    if kind in (Union, UnionType):
-        return " or ".join(_words(option) for option in options)
-    return {
-        int: "a whole number",
-        float: "a number",
-        bool: "true or false",
-        str: "text",
-        Path: "a path",
-        NoneType: "none",
-    }.get(hint, str(hint))
+        return typed(hint, items if listed else value, key, strict=False)
+    except InputError as error:
+        raise InputError(str(error).replace(", got str", f", got {value!r}")) from None

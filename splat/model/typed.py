@@ -53,8 +53,9 @@ class Settings(Typed):
             raise InputError(f"{name!r}: expected 0 or a number of a size from {LEAST:.3g} to {MOST:g}, got {value}")
 
 
-def typed(kind: Any, content: Any, where: str = "") -> Any:
-    """content as a value of this type; dataclasses make their own checks too.  where: its name in messages.
+def typed(kind: Any, content: Any, where: str = "", strict: bool = True) -> Any:
+    """content as a value of this type; dataclasses make their own checks too.  where: its name in messages.  strict: text is no
+    number and no truth value.
 
     InputError, of one line, that says at which key what was expected and what was found.
 
@@ -64,7 +65,7 @@ def typed(kind: Any, content: Any, where: str = "") -> Any:
     """
     _require_no_tensor(kind, content, where)
     try:
-        return msgspec.convert(content, kind, strict=True)
+        return msgspec.convert(content, kind, strict=strict)
     except msgspec.ValidationError as error:
         said, _, path = str(error).replace("`", "").partition(" - at ")
         path = path.rpartition("$")[2]
@@ -72,7 +73,7 @@ def typed(kind: Any, content: Any, where: str = "") -> Any:
         if "..." not in path:
             kind, found = _at(re.findall(r"\w+", path), kind, content)
         if said.startswith("Invalid enum"):
-            said = f"expected {' or '.join(map(repr, _choices(kind)))}"
+            said = f"expected {' or '.join(_choices(kind))}"
         if ", got" not in said and isinstance(found, int | float | str):
             large = type(found) is int and abs(found) >= 2**63
             said += ", got a whole number of more than 64 bits" if large else f", got {reprlib.repr(found)}"
@@ -101,10 +102,13 @@ def _at(names: list[str], kind: Any, content: Any) -> tuple[Any, Any]:
     return kind, content
 
 
-def _choices(kind: Any) -> tuple[Any, ...]:
-    while get_origin(kind) is not Literal:
-        kind = get_args(kind)[0]
-    return get_args(kind)
+def _choices(kind: Any) -> list[str]:
+    """What a value may be, of a type with choices: their words, and the numbers that it may be besides."""
+    if kind in (int, float):
+        return [kind.__name__]
+    if get_origin(kind) is Literal:
+        return [repr(choice) for choice in get_args(kind)]
+    return [word for part in get_args(kind) for word in _choices(part)]
 
 
 def leaves(settings: Mapping[str, Any]) -> dict[str, Any]:
