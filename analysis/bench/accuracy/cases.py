@@ -100,7 +100,7 @@ class MeteredOperator:
         self.matvecs, self.seconds, self.spent = 0.0, 0.0, 0.0
 
     def apply(self, V: Tensor) -> Tensor:
-        require_vectors(V, self.dim)
+        require_vectors(V, self.dim, self.dtype)
         start = perf_counter()
         result = self.inner.apply(V)
         spent = perf_counter() - start
