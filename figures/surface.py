@@ -26,12 +26,12 @@ from analysis.console.drawing import own_python
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
+from figures.eye import eye_over
 from figures.plane import Direction, Plane, plane
 from figures.render_surface import Box
 from figures.scripts import script
 from figures.style import BLACK, FIELD_MAP, VERMILION, new_figure, style
 from landscape.errors import InputError
-from landscape.slices.eye import eye_over
 
 RENDERER = "figures.render_surface"
 TIME_LIMIT = 120  # seconds for one picture

@@ -38,7 +38,7 @@ from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, re
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map
 from analysis.records.schema import INDICES
 from analysis.records.tables import bracketed, family_lines
-from landscape.slices.eye import eye_over
+from figures.eye import eye_over
 from splat.model.untrusted import replacing
 
 FILE, SPLATS = "report.html", "view.html"  # in the record's folder, and beside it: the page of `landscape view --html`

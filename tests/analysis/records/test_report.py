@@ -19,7 +19,7 @@ from analysis.records.quantities import exponent_of
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
 from analysis.records.report import interactive_surface, numbers, write_report
 from analysis.records.tables import family_table, probe_table
-from landscape.slices.eye import eye_over
+from figures.eye import eye_over
 from splat.training.origin.fingerprint import Fingerprint, ViewData
 from tests.recorded import depth_section, probe_of, soft, synthetic, written
 

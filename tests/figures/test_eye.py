@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from landscape.slices.eye import RISES, eye_over, hidden_points
+from figures.eye import RISES, eye_over, hidden_points
 
 
 def test_a_surface_is_seen_from_where_its_valley_is_nothidden_points():
