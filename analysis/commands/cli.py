@@ -5,6 +5,7 @@ Every subcommand imports what it needs when it runs, so that `landscape --help` 
 """
 
 import gc
+import inspect
 import os
 import sys
 from collections.abc import Sequence
@@ -36,7 +37,8 @@ DEBUG, CHECKPOINT = "--debug", "checkpoint.pt"
 
 @dataclass(frozen=True)
 class Command:
-    """A subcommand.  options: what is parsed; runs: MODULE:FUNCTION, imported when it runs, called with the options.
+    """A subcommand.  options: what is parsed; runs: MODULE:FUNCTION, imported when it runs, called with the options; example:
+    words after its name that are shown in its help.
 
     recorded: the function is also given the command as typed; draws: and a `Draw` of this module of figures, whose process
     starts at once; compiles: it says so when kernels are compiled.
@@ -44,32 +46,89 @@ class Command:
 
     options: type
     runs: str
+    example: str
     recorded: bool = False
     draws: str | None = None
     compiles: bool = False
 
 
-COMMANDS = {
-    "sfm": Command(SfmOptions, "analysis.commands.sfm:run_sfm"),
-    "train": Command(TrainOptions, "analysis.train.command:run_training", recorded=True, compiles=True),
-    "sweep": Command(SweepOptions, "analysis.runs.sweep.sweep:run_sweep"),
-    "probe": Command(ProbeOptions, "analysis.probe.command:run_probe", recorded=True, draws="make_all", compiles=True),
-    "slice": Command(SliceOptions, "analysis.slice.command:run_slice", recorded=True, compiles=True),
-    "map": Command(MapOptions, "analysis.commands.map.command:run_map", recorded=True, draws="maps", compiles=True),
-    "view": Command(ViewOptions, "analysis.commands.view.command:run_view", compiles=True),
-    "prune": Command(PruneOptions, "analysis.commands.uses.prune:run_prune", recorded=True, compiles=True),
-    "next-view": Command(
-        NextViewOptions, "analysis.commands.uses.next_view:run_next_view", recorded=True, compiles=True
-    ),
-    "uncertainty": Command(
-        UncertaintyOptions, "analysis.commands.uses.uncertainty:run_uncertainty", recorded=True, compiles=True
-    ),
-    "compare": Command(CompareOptions, "analysis.runs.compare:run_compare"),
-    "convert": Command(ConvertOptions, "analysis.commands.convert:run_convert"),
-    "demo": Command(DemoOptions, "analysis.commands.demo:run_demo", compiles=True),
-    "trajectory": Command(TrajectoryOptions, "analysis.runs.trajectories:run_trajectory"),
-    "bench": Command(BenchOptions, "analysis.bench.command:run_bench"),
+GROUPS = {  # as a person works
+    "make": {
+        "sfm": Command(SfmOptions, "analysis.commands.sfm:run_sfm", "PHOTOS"),
+        "train": Command(
+            TrainOptions,
+            "analysis.train.command:run_training",
+            "SCENE --views 3 --out runs/fern",
+            recorded=True,
+            compiles=True,
+        ),
+        "sweep": Command(SweepOptions, "analysis.runs.sweep.sweep:run_sweep", "notebooks/study_small.toml"),
+        "demo": Command(DemoOptions, "analysis.commands.demo:run_demo", "", compiles=True),
+    },
+    "measure": {
+        "probe": Command(
+            ProbeOptions,
+            "analysis.probe.command:run_probe",
+            "runs/fern",
+            recorded=True,
+            draws="make_all",
+            compiles=True,
+        ),
+        "slice": Command(
+            SliceOptions, "analysis.slice.command:run_slice", "runs/fern --along gradient", recorded=True, compiles=True
+        ),
+        "compare": Command(CompareOptions, "analysis.runs.compare:run_compare", "runs/fern runs/fern-stable"),
+        "trajectory": Command(
+            TrajectoryOptions, "analysis.runs.trajectories:run_trajectory", "runs/fern runs/fern-stable"
+        ),
+        "bench": Command(BenchOptions, "analysis.bench.command:run_bench", "runs/fern"),
+    },
+    "see": {
+        "map": Command(
+            MapOptions, "analysis.commands.map.command:run_map", "runs/fern", recorded=True, draws="maps", compiles=True
+        ),
+        "view": Command(ViewOptions, "analysis.commands.view.command:run_view", "runs/fern", compiles=True),
+    },
+    "use": {
+        "prune": Command(
+            PruneOptions, "analysis.commands.uses.prune:run_prune", "runs/fern --keep 0.5", recorded=True, compiles=True
+        ),
+        "next-view": Command(
+            NextViewOptions, "analysis.commands.uses.next_view:run_next_view", "runs/fern", recorded=True, compiles=True
+        ),
+        "uncertainty": Command(
+            UncertaintyOptions,
+            "analysis.commands.uses.uncertainty:run_uncertainty",
+            "runs/fern",
+            recorded=True,
+            compiles=True,
+        ),
+    },
+    "exchange": {
+        "convert": Command(
+            ConvertOptions,
+            "analysis.commands.convert:run_convert",
+            "point_cloud.ply runs/theirs/checkpoint.pt --scene SCENE",
+        )
+    },
 }
+COMMANDS = {name: each for group in GROUPS.values() for name, each in group.items()}
+
+
+def overview() -> str:
+    """The commands in the groups of `GROUPS`, a line each."""
+    lines = ["usage: landscape COMMAND ...", "", "See the loss landscape of a 3D Gaussian Splatting scene."]
+    for title, group in GROUPS.items():
+        lines += ["", title]
+        lines += [f"  {name:12} {inspect.getdoc(each.options).splitlines()[0]}" for name, each in group.items()]  # pyright: ignore[reportOptionalMemberAccess]
+    return "\n".join(
+        [
+            *lines,
+            "",
+            "landscape COMMAND --help has its options and an example, landscape --version the version;",
+            f"{DEBUG} shows where in the program an error came up.",
+        ]
+    )
 
 
 def command() -> NoReturn:
@@ -139,22 +198,23 @@ def _parsed(arguments: Sequence[str]) -> tuple[Command, Any]:
 
     SystemExit for help, and where they cannot be parsed; InputError for a command that there is not.
     """
-    name, config = (*arguments, "")[0], (tyro.conf.DisallowNone,)
+    name = (*arguments, "")[0]
     if found := COMMANDS.get(name):
+        about = f"{inspect.getdoc(found.options)}\n\nExample: landscape {name} {found.example}".rstrip()
+        config = (tyro.conf.DisallowNone,)
         return found, tyro.cli(
-            found.options, prog=f"landscape {name}", args=arguments[1:], config=config, registry=REGISTRY
+            found.options,
+            prog=f"landscape {name}",
+            description=about,
+            args=arguments[1:],
+            config=config,
+            registry=REGISTRY,
         )
-    if name and not name.startswith("-"):
-        raise InputError(f"expected a command among {', '.join(COMMANDS)}, got {name!r}{did_you_mean(name, COMMANDS)}")
-    options = tyro.extras.subcommand_cli_from_dict(
-        {name: each.options for name, each in COMMANDS.items()},
-        prog="landscape",
-        description=f"See the loss landscape of a 3D Gaussian Splatting scene.\n{DEBUG}, before or after the subcommand, shows "
-        "where in the program an error came up.  --version alone shows the version.",
-        args=arguments,
-        config=config,
-    )
-    return next(each for each in COMMANDS.values() if isinstance(options, each.options)), options
+    if name in ("-h", "--help"):
+        print(overview())
+        raise SystemExit(0)
+    wrong = f", got {name!r}{did_you_mean(name, COMMANDS)}" if name else ", got none; landscape --help lists them"
+    raise InputError(f"expected a command among {', '.join(COMMANDS)}{wrong}")
 
 
 def at_files(options: Any) -> Any:

@@ -5,6 +5,7 @@ VALUE   a plain value, or text that is read by the setting's type: a number, tru
         that is allowed, a list with commas (empty: no entry)
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
 from difflib import SequenceMatcher
@@ -104,16 +105,15 @@ def _changed(settings: T, path: list[str], value: Any, key: str) -> T:
 
 def read_value(value: Any, hint: Any, key: str) -> Any:
     """A value of a setting's type, from a plain one or from text."""
-    if not isinstance(value, str):
-        return typed(hint, value, key)
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    if value == "none" and NoneType in kinds:
+    text = isinstance(value, str)
+    if text and value == "none" and NoneType in kinds:
         return None
-    if Path in kinds:
+    if text and Path in kinds:
         return Path(value)
-    listed = any(get_origin(kind) is tuple for kind in kinds)
-    items = [item.strip() for item in value.split(",") if item.strip()]
+    listed = text and any(get_origin(kind) is tuple for kind in kinds)
+    content = [item.strip() for item in value.split(",") if item.strip()] if listed else value
     try:
-        return typed(hint, items if listed else value, key, strict=False)
+        return typed(hint, content, key, strict=not text)
     except InputError as error:
-        raise InputError(str(error).replace(", got str", f", got {value!r}")) from None
+        raise InputError(re.sub(r", got (str|int|float|bool)$", f", got {value!r}", str(error))) from None

@@ -315,7 +315,6 @@ def test_a_checkpoint_whose_scene_has_moved_says_so_and_takes_its_folder(scene, 
         (["train"], "landscape train --help"),
         (["train", "scene", "--views", "three"], "landscape train --help"),
         (["slice", "scene", "--wings", "2"], "landscape slice --help"),
-        ([], "landscape --help"),
     ],
 )
 def test_arguments_that_cannot_be_read_exit_with_2_and_name_their_help(wrong, page, capsys):
@@ -325,9 +324,26 @@ def test_arguments_that_cannot_be_read_exit_with_2_and_name_their_help(wrong, pa
     assert caught.value.code == 2 and page in said and said.count("--help") == 1
 
 
+def test_the_help_has_every_command_once_in_groups_and_theirs_an_example(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert caught.value.code == 0 and len(lines) <= 60
+    assert [line for line in lines if line in ("make", "measure", "see", "use", "exchange")] == [*GROUPS]
+    assert [line.split()[0] for line in lines if line.startswith("  ")] == [*COMMANDS]
+    for name in ("map", "sweep", "convert"):
+        with pytest.raises(SystemExit):
+            main([name, "--help"])
+        said = capsys.readouterr().out
+        assert f"Example: landscape {name} {COMMANDS[name].example}" in " ".join(said.split())
+        assert len(said.splitlines()) <= 60
+
+
 def test_a_command_that_there_is_not_is_refused_with_the_one_that_was_meant(capsys):
     assert main(["trian", "scene"]) == 2
     one_sentence(capsys, "expected a command among sfm, train, ", "got 'trian'; did you mean train?")
+    assert main([]) == 2
+    one_sentence(capsys, "expected a command among sfm, train, ", "got none; landscape --help lists them")
 
 
 @pytest.mark.parametrize(
