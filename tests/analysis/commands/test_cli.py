@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 from analysis.bench.options import BenchOptions
-from analysis.commands.cli import COMMANDS, at_files, main
+from analysis.commands.cli import COMMANDS, GROUPS, at_files, main
 from analysis.commands.options import ConvertOptions
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import CompareOptions
@@ -331,7 +331,7 @@ def test_the_help_has_every_command_once_in_groups_and_theirs_an_example(capsys)
     assert caught.value.code == 0 and len(lines) <= 60
     assert [line for line in lines if line in ("make", "measure", "see", "use", "exchange")] == [*GROUPS]
     assert [line.split()[0] for line in lines if line.startswith("  ")] == [*COMMANDS]
-    for name in ("map", "sweep", "convert"):
+    for name in ("bench", "sweep", "convert"):
         with pytest.raises(SystemExit):
             main([name, "--help"])
         said = capsys.readouterr().out
