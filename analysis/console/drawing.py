@@ -5,13 +5,11 @@ renderer that ends its process (VTK does, where OpenGL is missing) cannot take a
 ends a process that draws before any that measures.
 """
 
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -92,9 +90,3 @@ def own_python(module: str, *words: object, **environment: str) -> dict[str, Any
     """
     command = [sys.executable, "-P", "-m", module, *map(str, words)]
     return {"args": command, "env": {**os.environ, "PYTHONPATH": str(ROOT), **environment}}
-
-
-def own_pool() -> ProcessPoolExecutor:
-    """A process that runs functions of this program, begun anew as `own_python` is."""
-    os.environ["PYTHONSAFEPATH"] = "1"  # as -P, in all that is started from here on
-    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))

@@ -6,7 +6,7 @@ from time import monotonic
 
 import pytest
 
-from analysis.console.drawing import ROOT, draw, drawing, own_pool
+from analysis.console.drawing import ROOT, draw, drawing
 from figures.make_all import FIGURES
 from tests.recorded import synthetic, written
 from tests.waiting import PATIENCE, waits_for
@@ -73,15 +73,6 @@ def test_nothing_beside_a_scene_is_run_or_read_by_what_draws(tmp_path, monkeypat
     said = draw("make_all", Path("probe"))
     assert not marks.exists(), sorted(path.name for path in marks.iterdir())
     assert {path.stem for path in folder.glob("*.png")} == {*FIGURES} - {"slice1d"}, said
-
-
-def test_nor_by_a_process_that_is_begun_anew(tmp_path, monkeypatch):
-    (tmp_path / "multiprocessing.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONSAFEPATH", "")
-    with own_pool() as pool:
-        assert pool.submit(abs, -3).result() == 3
-    assert not (tmp_path / "ran").exists()
 
 
 def test_every_python_is_started_by_one_function():
