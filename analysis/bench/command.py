@@ -26,7 +26,8 @@ from analysis.records.provenance import machine
 from landscape.errors import InputError
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import thread_count
-from splat.backend.device import by_triton, device_named
+from splat.backend.device import device_named
+from splat.render.backend import CPU
 
 SIZES = ("10k@504x378", "100k@504x378")
 # what the project promises of times: what, to what, at most
@@ -90,7 +91,7 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
             for name, time in per_vector(measured).items()
         ]
         workspaces = {K: bench.workspace(K, meter) for K in VECTORS}
-        found = [*ratios(measured, by_triton(bench.like)), *memory(workload, bench, workspaces)]
+        found = [*ratios(measured, bench.backend is not CPU), *memory(workload, bench, workspaces)]
         times.append(pd.DataFrame(lines))
         bounds.append(pd.DataFrame({"scene": workload.name, **line} for line in found))
         about = f"{len(workload.gaussians)} Gaussians, {camera.width} x {camera.height} px, {view.touched} visible"

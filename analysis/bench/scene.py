@@ -21,14 +21,12 @@ import torch
 from analysis.bench.timing import Meter, Timing
 from analysis.bench.workloads import Workload
 from landscape.probes import draw_probes
-from splat.backend.device import by_triton
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import LinearizedView
-from splat.losses.autograd import loss_against, view_loss
+from splat.losses.autograd import view_loss
 from splat.model.settings import Accumulation
-from splat.projection.dispatch import plain_gradient, projected, projected_vjp
 from splat.projection.formulas import lens_of
-from splat.raster.dispatch import rasterize
+from splat.render.backend import CPU, backend_of, plain_gradient
 from splat.render.render import render
 
 VECTORS = (1, 4, 8)
@@ -43,8 +41,9 @@ class ViewBench:
         self.like, camera = workload.gaussians.flat.detach(), self.view.camera
         self.lens = lens_of(camera, workload.settings)
         self.background = workload.background.to(self.like)
-        self.loss = loss_against(self.view.image, workload.loss, self.like)
-        self.projected = projected(workload.gaussians, self.lens)
+        self.backend = backend_of(self.like)
+        self.loss = self.backend.view_loss(self.view.image, workload.loss, self.like)
+        self.projected = self.backend.project(workload.gaussians, self.lens)
         self.raster = self._rasterize(self.projected)
         self.cotangent = self.loss.linearize(self.raster.planes).gradient
         self.linearized = self._linearize()
@@ -53,7 +52,7 @@ class ViewBench:
 
     def _rasterize(self, found: tuple[torch.Tensor, torch.Tensor, torch.Tensor]) -> Any:
         camera, settings = self.view.camera, self.workload.settings
-        return rasterize(*found, self.background, camera.width, camera.height, settings)
+        return self.backend.rasterize(*found, self.background, camera.width, camera.height, settings)
 
     def _linearize(self) -> Any:
         w = self.workload
@@ -61,14 +60,14 @@ class ViewBench:
 
     def gradient(self) -> torch.Tensor:
         """Gradient of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
-        splats, depths, drawn = projected(self.workload.gaussians, self.lens)
+        splats, depths, drawn = self.backend.project(self.workload.gaussians, self.lens)
         raster = self._rasterize((splats, depths, drawn))
         adjoint = raster.backward(self.loss.linearize(raster.planes, second_order=False).gradient)
         return self._to_parameters(splats, drawn, adjoint)
 
     def _to_parameters(self, splats: torch.Tensor, drawn: torch.Tensor, adjoint: Any) -> torch.Tensor:
         bar = plain_gradient(splats, adjoint.moments)
-        return projected_vjp(self.workload.gaussians, self.lens, splats, drawn, bar)
+        return self.backend.project_vjp(self.workload.gaussians, self.lens, splats, drawn, bar)
 
     def gradient_by_autograd(self, accumulation: Accumulation = "deterministic") -> torch.Tensor:
         """The gradient through the graph of torch."""
@@ -87,8 +86,8 @@ class ViewBench:
             "linearize": self._linearize,
             **products,
             "block diagonal": self._block_diagonal,
-            **({"gradient, atomic": lambda: self.gradient_by_autograd("atomic")} if by_triton(self.like) else {}),
-            **({} if by_triton(self.like) else {"exact blocks": self.linearized.block_diagonal}),
+            **({"gradient, atomic": lambda: self.gradient_by_autograd("atomic")} if self.backend is not CPU else {}),
+            **({"exact blocks": self.linearized.block_diagonal} if self.backend.exact_blocks else {}),
         }
 
     def _block_diagonal(self) -> PerGaussianBlocks:

@@ -29,7 +29,7 @@ class MissingPeer(Exception):
 def gsplat_gradient(workload: Workload, view: View, loss: Any) -> Callable[[], object]:
     """The call, made once to see that it works.  MissingPeer where the package is not installed or does not run."""
     try:
-        from gsplat import rasterization  # pyright: ignore[reportMissingImports]
+        from gsplat import rasterization  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
     except ImportError as error:
         raise MissingPeer(f"gsplat cannot be imported ({error})") from None
     gaussians, camera = workload.gaussians, view.camera

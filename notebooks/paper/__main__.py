@@ -60,8 +60,10 @@ def _made(paths: Sequence[Path], out: Path):
 
 def tell(rows: pd.DataFrame, found: Sequence[Judgement], console: Console) -> None:
     """Print the verdicts, and the methods with too few seeds for one."""
-    seeds = rows.groupby(["scene", "views", "steps", "method"], sort=False)["seed"].nunique()
-    if few := [f"{place[-1]} ({count})" for place, count in seeds.items() if count < LEAST]:
+    seeds = pd.DataFrame(
+        rows.groupby(["scene", "views", "steps", "method"], sort=False)["seed"].nunique()
+    ).reset_index()
+    if few := [f"{row['method']} ({row['seed']})" for row in seeds.to_dict("records") if row["seed"] < LEAST]:
         say(f"fewer than {LEAST} seeds, which decide nothing: {', '.join(few)}", console=console)
     for each in found:
         style = STYLES[each.verdict]

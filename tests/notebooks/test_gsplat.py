@@ -8,7 +8,7 @@ import torch
 
 from analysis.bench.workloads import Size, synthetic_workload
 from notebooks.accuracy.gsplat import MissingPeer, gsplat_gradient
-from splat.losses.autograd import loss_against
+from splat.render.backend import backend_of
 
 
 def test_gsplat_is_given_the_same_view_and_the_same_loss(monkeypatch):
@@ -22,7 +22,7 @@ def test_gsplat_is_given_the_same_view_and_the_same_loss(monkeypatch):
     monkeypatch.setattr(module, "rasterization", rasterization, raising=False)
     monkeypatch.setitem(sys.modules, "gsplat", module)
     view = workload.views[0]
-    loss = loss_against(view.image, workload.loss, workload.gaussians.flat)
+    loss = backend_of(workload.gaussians.flat).view_loss(view.image, workload.loss, workload.gaussians.flat)
     gsplat_gradient(workload, view, loss)()
     homogeneous = torch.cat([workload.gaussians.means, torch.ones(4, 1)], dim=1) @ seen["poses"][0].T
     camera = view.camera

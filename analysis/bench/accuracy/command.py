@@ -50,7 +50,7 @@ from splat.curvature.traces import ONE_PERCENT, exact_traces
 
 Origin = Literal["default", "own", "peer"]
 PASS = 1.35  # 1.2 for the pass, 0.15 for the ends
-# operations of a pixel and a Gaussian along the tangents, over those with the way back (`raster.formulas`)
+# operations of a pixel and a Gaussian along the tangents, over those with the way back (`render.formulas`)
 JACOBIAN = 25 / (25 + 46)
 BUDGETS = (12, 36)  # matvecs a block
 TOLERANCES = (1e-1, 1e-2)  # of residuals; 1e-3 is the default
@@ -279,7 +279,7 @@ def run_accuracy(checkpoint: Path, out: Path, downscale: float, seeds: int) -> i
     table = pd.DataFrame(vars(run) for method, seed in shown for run in measure(case, method, seed))
     means = points(table, {case.name: case.round_off})
     for quantity, lines in means.groupby("quantity", sort=False):
-        console.print(rich_table(pd.DataFrame(lines)[SHOWN], f"{quantity} of {case.name}"))
+        console.print(rich_table(pd.DataFrame(lines).filter(SHOWN), f"{quantity} of {case.name}"))
     write_table(means, out / "accuracy.csv", console)
     say(*draw("accuracy", out / "accuracy.csv"), f"{out}/accuracy_*.png", console=console)
     return 0

@@ -14,7 +14,7 @@ from analysis.bench.timing import Meter, Timing, interleaved
 from analysis.bench.workloads import Size, synthetic_workload
 from analysis.commands.cli import main
 from splat.curvature.objective import SceneObjective
-from splat.raster.formulas import SPLAT
+from splat.render.formulas import SPLAT
 
 TINY = Size(60, 40, 24)
 

@@ -15,6 +15,7 @@ from analysis.bench.scene import ViewBench
 from analysis.bench.timing import Meter, Timing
 from analysis.bench.workloads import Workload
 from splat.losses.reference import LossSettings
+from tests.splat.gpu.emulated import emulate
 from tests.splat.held_scenes import two_views
 from tests.splat.random_scenes import random_gaussians, relative_error
 
@@ -41,7 +42,7 @@ class StillClock(Meter):
 @pytest.fixture
 def gpu(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     """The device, with its kernels for all tensors on it."""
-    monkeypatch.setattr("splat.backend.device.EMULATED", device.type == "cpu")
+    emulate(monkeypatch, device.type == "cpu")
     return device
 
 
@@ -60,6 +61,6 @@ def test_a_bench_on_a_gpu_measures_its_kernels_with_the_numbers_of_the_cpu(gpu, 
     measured = dict(zip(bounds["what"], bounds["measured"], strict=True))
     assert measured["H v 1 / gradient"] == 1 and measured["H v 8 / gradient"] == 1 / 8
     found = [own.gradient(), own.gradient_by_autograd("atomic"), own.linearized.gradient]
-    monkeypatch.setattr("splat.backend.device.EMULATED", False)
+    emulate(monkeypatch, False)
     expected = ViewBench(toy()).gradient()
     assert all(relative_error(gradient.cpu(), expected) < 1e-5 for gradient in found)

@@ -60,9 +60,9 @@ def test_gaussians_that_change_places_in_the_order_are_told_apart(workload):
 
 
 def test_an_error_in_single_precision_alone_is_seen(workload, monkeypatch):
-    def spoiled(image, loss, like):
-        return CpuViewLoss(image * (1.01 if like.dtype == torch.float32 else 1.0), loss, like.dtype)
+    def spoiled(image, loss, dtype):
+        return CpuViewLoss(image * (1.01 if dtype == torch.float32 else 1.0), loss, dtype)
 
-    monkeypatch.setattr("tests.splat.curvature.precision.loss_against", spoiled)
+    monkeypatch.setattr("splat.render.backend.CpuViewLoss", spoiled)
     lines = {line.quantity: line.error for line in precision(workload) if line.decisions == "held equal"}
     assert lines["image"] < 1e-5 < 1e-4 < lines["gradient"]

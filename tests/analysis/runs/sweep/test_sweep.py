@@ -159,7 +159,7 @@ def test_a_cell_is_the_command_that_a_user_would_type(folder):
         ("iterations = 6", "iterations = 0.5", "'iterations': expected int.*, got .*0.5"),
         ("iterations = 6", "iteration = 6", "expected a key among out, seeds, .*, got iteration"),
         ("seeds = [1, 0]", "seeds = [1, 1]", r"expected different seeds, at least one, got seeds = \[1, 1\]"),
-        ("seeds = [1, 0]", "seeds = [0.5]", "'seeds': expected int, got 0.5"),
+        ("seeds = [1, 0]", "seeds = [0.5]", "'seeds.0.': expected int, got"),
         ('out = "out"', "", "expected the folder of the results"),
         ("[scenes.still]", "[scenes]", "expected a table .scenes.path., got path = 'still'"),
         ('"asp only"', '"../asp"', "as it names a folder, got '../asp'"),
