@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from analysis.runs.claims.study import row_of
 from PIL import Image
 
 from analysis.commands.cli import main
@@ -17,7 +18,6 @@ from analysis.records.quantities import measured, quantity
 from analysis.records.schema import Index
 from analysis.records.tables import bracketed
 from analysis.runs import compared
-from analysis.runs.claims.study import row_of
 from figures.compare import draw_comparison
 from landscape.errors import InputError
 from splat.losses.reference import LossSettings
