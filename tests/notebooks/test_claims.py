@@ -172,12 +172,13 @@ def test_a_map_of_a_run_adds_what_one_view_sees(tmp_path, monkeypatch):
 
     shares = {"quats": 0.6, "log_scales": 0.5}
     fragile = SimpleNamespace(opacity_one_view=0.25, needles=0.1, needles_trace=shares, depth_gradient=None)
-    found = SimpleNamespace(fragility=fragile)
+    found = SimpleNamespace(fragility=fragile, provenance=SimpleNamespace(fingerprint=None))
+    monkeypatch.setattr(module, "require_own", lambda made, state, path, again: None)
     monkeypatch.setattr(module, "read_map", lambda folder: found if folder == tmp_path / "map" else None)
-    assert module._of_map(tmp_path) == {}
+    assert module._of_map(tmp_path, "state") == {}
     (tmp_path / "map").mkdir()
     (tmp_path / "map" / "map.json").touch()
-    row = module._of_map(tmp_path)
+    row = module._of_map(tmp_path, "state")
     assert np.isnan(row.pop("depth_gradient"))
     assert row == {
         "opacity_one_view": 0.25, "needle_count": 0.1, "needles_quats": 0.6, "needles_log_scales": 0.5,
