@@ -14,7 +14,7 @@ derivative of the image: it is Gauss-Newton's, and with the stored logit z, d om
 
 where G_zz has SSIM's coupling of pixels.  For the L2 loss that is the change itself, but where alpha is cut, capped, or a pixel
 stops; under L1 residuals that change sign are not seen.  It is taken at logits of OPAQUE at most, which draw the same pictures
-to 6e-6: beyond, 1 - omega is soon rounded to 0, and both quotients to 0 / 0.  Eigenvalues below d eps times the block's
+to 1.2e-4: beyond, 1 - omega is soon rounded to 0, and both quotients to 0 / 0.  Eigenvalues below d eps times the block's
 largest, which few views determine, count as that much.
 """
 
@@ -31,7 +31,7 @@ from splat.curvature.objective import SceneObjective
 
 EXACT = ("rise", "rise_l2", "log_det_6", "log_det_11", "gn_diagonal")
 SCORES = (*EXACT, "opacity", "size_opacity")
-OPAQUE = 12.0  # a logit at which 1 - omega is 6e-6, a hundred units of round-off in single precision
+OPAQUE = 9.0  # a logit at which 1 - omega is 1.2e-4, and known to 2.4e-4 of itself in single precision
 GONE = -50.0  # a logit with which a Gaussian is drawn nowhere
 
 
@@ -70,10 +70,7 @@ def predicted_rise(objective: SceneObjective) -> Float64[Tensor, " n"]:
     z = objective.active.opacity_logits.double()
     slope = objective.gradient[objective.blocks["opacity_logits"]].double()
     curvature = objective.exact_blocks[1].geometry[:, 10, 10].double()
-    double = objective.settings.antialias != "none" or objective.active.filter_widths is not None
-    # 1 - omega, rounded as it is where the derivatives are computed
-    left = 1 - z.sigmoid().to(torch.float64 if double else objective.active.flat.dtype).double()
-    return -slope / left + curvature / (2 * left.square())
+    return -slope / (-z).sigmoid() + curvature / (2 * (-z).sigmoid().square())
 
 
 def _below_opaque(objective: SceneObjective) -> SceneObjective:

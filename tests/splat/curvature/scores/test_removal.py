@@ -61,8 +61,8 @@ def test_opaque_gaussians_are_scored_by_their_removal(logit, dtype):
     objective = SceneObjective(gaussians, two_views(), L2, BACKGROUND.to(dtype), SMOOTH)
     rise = removal_scores(objective, objective)["rise_l2"]
     true = removal_errors(objective, torch.arange(len(rise)))
-    # the loss, and so its change, is known to round-off
-    bound = 1e-8 * true.abs() + 100 * torch.finfo(dtype).eps * objective.loss(objective.active.flat)
+    # 1 - omega at the logit OPAQUE, and twice its rounding in single precision; the loss is known to round-off
+    bound = 1e-3 * true.abs() + 100 * torch.finfo(dtype).eps * objective.loss(objective.active.flat)
     assert (true[:4].abs() > 10 * bound[:4]).all() and ((rise - true).abs() <= bound).all(), (rise, true)
 
 
