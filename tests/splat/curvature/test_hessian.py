@@ -272,7 +272,7 @@ def test_what_was_linearized_is_freed_with_its_objective():
 
 def test_released_views_are_made_anew():
     objective = SceneObjective(random_gaussians(30), two_views(16, 12))
-    hessian, V = SceneHessian(objective), torch.randn(len(objective.active.flat), 2)
+    hessian, V = SceneHessian(objective), torch.randn(len(objective.active.flat), 2).double()
     before, view = hessian.apply(V), ref(objective.linearized.first)
     objective.release()
     assert view() is None
