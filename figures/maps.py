@@ -26,7 +26,17 @@ from matplotlib.transforms import Affine2D, Bbox, TransformedBbox
 
 from analysis.console.failures import program
 from analysis.records.quantities import BYTES, Shade, percent, quantity
-from analysis.records.run_files import Carrier, MapRecord, Panel, Steepest, Swaps, read_map
+from analysis.records.run_files import (
+    END_MAPS,
+    VIEW_MAPS,
+    Carrier,
+    MapRecord,
+    Panel,
+    Steepest,
+    Swaps,
+    read_map,
+    read_maps,
+)
 from figures.scripts import folder_script
 from figures.style import BLACK, BLUE, GREEN, VERMILION, literal, save, style
 
@@ -254,8 +264,7 @@ def draw_maps(folder: Path, suffix: str = "png", processes: int = 2) -> list[Pat
 
 def _draw(folder: Path, suffix: str, record: MapRecord, job: tuple[str, str]) -> Path:
     kind, file = job
-    with np.load(folder / f"{file}.npz", allow_pickle=False) as arrays:
-        maps = dict(arrays)
+    maps = read_maps(folder, file, END_MAPS if kind == "steepest" else (*VIEW_MAPS, *record.shades))
     if kind == "steepest":
         figure = draw_steepest(maps, next(end for end in record.steepest if end.file == file))
     else:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from splat.model.untrusted import read_arrays
+
 
 @dataclass(frozen=True, eq=False)
 class Box:
@@ -74,5 +76,5 @@ if __name__ == "__main__":
     if len(sys.argv) != 3:
         print("expected FIELD.npz OUT.png; to draw a record: python -m figures.surface RUN/probe", file=sys.stderr)
         sys.exit(2)
-    with np.load(sys.argv[1], allow_pickle=False) as field:
-        render(field["height"], field["dots"], field["colour"], field["levels"], field["eye"], Path(sys.argv[2]))
+    field = read_arrays(Path(sys.argv[1]))
+    render(field["height"], field["dots"], field["colour"], field["levels"], field["eye"], Path(sys.argv[2]))

@@ -26,6 +26,7 @@ from figures.style import (
     style,
 )
 from landscape.errors import InputError
+from splat.model.untrusted import read_arrays
 
 SCORES = {
     "rise": ("rise of the loss", VERMILION),
@@ -113,7 +114,8 @@ def draw_uncertainty(path: Path) -> Figure:
         "block": "uncertainty (blocks)",
         "diagonal": "uncertainty (diagonal)",
     }
-    with style(), np.load(path, allow_pickle=False) as maps:
+    maps = read_arrays(path)
+    with style():
         height, width = maps["error"].shape
         figure = new_figure(6.6 / len(words) * height / width + 0.4, 6.6)
         for axes, (name, title) in zip(figure.subplots(1, len(words)), words.items(), strict=True):

@@ -28,7 +28,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     >>> did_you_mean("warmup", ["warm_up", "gamma"]), did_you_mean("teapot", ["gamma"])
     ('; did you mean warm_up?', '')
     """
-    near = get_close_matches(name, list(known), n=1)
+    near = get_close_matches(name, list(known), n=1, cutoff=0.7)
     return f"; did you mean {near[0]}?" if near else ""
 
 

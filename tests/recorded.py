@@ -1,10 +1,12 @@
 """Synthetic records for the tests of what reads records: a quartic valley with known numbers."""
 
 import copy
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from analysis.records.json_files import fitted, plain
 from analysis.records.provenance import provenance
@@ -45,6 +47,43 @@ def own(run: Path, **options: Any) -> dict[str, Any]:
 
     path = run / "checkpoint.pt"
     return {"fingerprint": plain(asked(ProbeOptions(path, **options), load_checkpoint(path)))}
+
+
+def written_map(folder: Path, made: dict[str, Any]) -> None:
+    """The files of a map that a page reads.  made: its provenance."""
+    shade = {"name": "largest", "words": "largest <curvature>", "unit": "1", "scale": "log", "low": 0.0, "high": 1.0}
+    swaps = {"lengths": [1.0], "share": [[0.5]], "pairs": [4], "jump": None, "jump_error": None, "sampled": 0}
+    axes = {"condition": {"50": 2.0}, "needles": 0.1, "needles_steepest": {}, "needles_trace": {}, "one_view": 0.2}
+    axes |= {"swaps": swaps, "one_view_trace": None, "opacity_one_view": None}
+    found = {"gaussians": 5, "seen": 4, "field": "largest", "shades": {"largest": shade}, "fragility": axes}
+    found |= {"panels": [{"name": "a.png", "place": 0, "file": "view-000", "psnr": 20.0}], "provenance": made}
+    found["shades"]["error"] = shade | {"name": "error", "words": "error"}
+    carrier = {
+        "gaussian": 3778,
+        "share": 0.8,
+        "attributes": {"quats": 0.8},
+        "sigmas": [0.4, 0.02, 0.01],
+        "aspect": 41.0,
+    }
+    carrier |= {"opacity": 0.7, "views": 1, "one_view": 1.0, "outline": [4.0, 3.0, 2.0, 1.0, 0.0]}
+    end = {"name": "e₁", "curvature": 3.0, "participation": 1.5, "carriers": [carrier], "view": "a.png", "step": 0.1}
+    end |= {
+        "crop": [0, 0, 4, 3],
+        "losses": [1.1, 1.0, 1.2],
+        "factors": [1.9, 0.5],
+        "difference": shade,
+        "file": "steepest-e1",
+    }
+    found["steepest"] = [end | {"sentence": "80% of e₁ turns Gaussian 3,778.", "rendered": "Not confirmed by renders."}]
+    found["steepest"].append(found["steepest"][0] | {"name": "e_min", "curvature": -1.0, "factors": [-0.2, -1.9]})
+    found["steepest"][1] |= {"sentence": "97% of e_min.", "rendered": "", "file": "steepest-e_min"}
+    found["sentences"] = ["80% of e₁ turns Gaussian 3,778.", "97% of e_min.", "Position: half of all pairs."]
+    folder.mkdir()
+    (folder / "map.json").write_text(json.dumps(found))
+    largest, error = np.full((6, 8), 254, np.uint8), np.zeros((6, 8), np.uint8)
+    np.savez(folder / "view-000.npz", largest=largest, error=error)
+    for name in ("steepest-e1.png", "fragility-000.png"):
+        Image.new("RGB", (8, 6)).save(folder / name)
 
 
 def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:

@@ -7,6 +7,7 @@ Every subcommand imports what it needs when it runs, so that `landscape --help` 
 import gc
 import inspect
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -24,7 +25,7 @@ from analysis.bench.options import BenchOptions
 from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions, ViewOptions
 from analysis.commands.uses.options import NextViewOptions, PruneOptions, UncertaintyOptions
 from analysis.console.failures import report
-from analysis.console.interruption import ignore, raising
+from analysis.console.interruption import interruption, loading
 from analysis.console.options import REGISTRY
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import CompareOptions, SweepOptions, TrajectoryOptions
@@ -141,10 +142,7 @@ def command() -> NoReturn:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is imported
     _open_streams()
     Console.on_broken_pipe = _say_no_more  # pyright: ignore[reportAttributeAccessIssue]
-    try:
-        code = main()
-    finally:  # after the help too
-        ignore()
+    code = main()
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -174,7 +172,7 @@ def _say_no_more(console: Console) -> None:
 
 def _drop(stream: IO[str]) -> None:
     """Send what is written to a stream nowhere."""
-    with open(os.devnull, "w") as nowhere:
+    with open(os.devnull, "w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), stream.fileno())
 
 
@@ -186,9 +184,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     debug, arguments = DEBUG in arguments, [word for word in arguments if word != DEBUG]
     try:
-        with raising():
-            command, options = _parsed(arguments)
-            return run(command, at_files(options), arguments)
+        command, options = _parsed(arguments)
+        return run(command, at_files(options), arguments)
     except (Exception, KeyboardInterrupt) as error:
         return report(error, ["landscape", *arguments], debug)
 
@@ -233,10 +230,8 @@ def at_files(options: Any) -> Any:
 
 def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand; returns the exit code."""
-    from splat.backend.memory import RESERVE, require_room  # not for --help
-
-    require_room(RESERVE, libraries=True)
-    module, function = command.runs.split(":")
+    _require_compiler()
+    name, function = command.runs.split(":")
     with ExitStack() as around:
         given = [options, ["landscape", *arguments]] if command.recorded else [options]
         if command.compiles:
@@ -247,7 +242,24 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
             from analysis.console.drawing import drawing
 
             given.append(around.enter_context(drawing(command.draws)))
-        return getattr(import_module(module), function)(*given)
+        with loading():
+            module = import_module(name)
+        if command.recorded:
+            around.enter_context(interruption())
+        return getattr(module, function)(*given)
+
+
+def _require_compiler() -> None:
+    """InputError for settings of Numba that keep it from compiling, or that a stranger's folder brings."""
+    threads = os.environ.get("NUMBA_NUM_THREADS", "1")
+    if re.fullmatch(r"-\d+|0+", threads):
+        raise InputError(f"expected NUMBA_NUM_THREADS of at least 1, got {threads}; unset it")
+    if (off := os.environ.get("NUMBA_DISABLE_JIT", "0")) not in ("", "0"):
+        raise InputError(f"expected kernels that Numba compiles, got NUMBA_DISABLE_JIT={off}; unset it")
+    if (file := Path(".numba_config.yaml")).is_file():
+        raise InputError(
+            f"expected no settings of Numba in the current folder, got {file}; begin in another, or move it"
+        )
 
 
 if __name__ == "__main__":

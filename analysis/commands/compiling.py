@@ -6,8 +6,6 @@ from contextlib import contextmanager
 from numba.core import event
 from rich.console import Console
 
-from splat.backend.memory import RESERVE, require_room
-
 SAID = "compiling kernels for this processor: seconds for one, up to two minutes for all; later runs find them"
 
 
@@ -16,7 +14,6 @@ class _Once(event.Listener):
         self.console, self.said = console, False
 
     def on_start(self, event: event.Event) -> None:
-        require_room(RESERVE)
         if not self.said:
             self.said = True
             self.console.print(SAID, style="dim", soft_wrap=True)
@@ -26,9 +23,6 @@ class _Once(event.Listener):
 
 @contextmanager
 def compiling_is_said(console: Console) -> Iterator[None]:
-    """Say it when the first kernel is compiled that an earlier run has not kept.
-
-    TooLittleMemory where limits of the process leave no room for a compiler.
-    """
+    """Say it when the first kernel is compiled that an earlier run has not kept."""
     with event.install_listener("numba:compile", _Once(console)):
         yield

@@ -1,8 +1,7 @@
 """Pictures of a record: the figures' own commands, each run in a process of its own.
 
 `figures/` reads what this package wrote and is not imported here, so that the arrow between them points one way; a
-renderer that ends its process (VTK does, where OpenGL is missing) cannot take a probe along.  Where memory runs out, Linux
-ends a process that draws before any that measures.
+renderer that ends its process (VTK does, where OpenGL is missing) cannot take a probe along.
 """
 
 import os
@@ -10,12 +9,11 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-FIRST_TO_END = "1000"  # of /proc/PID/oom_score_adj
 Draw = Callable[[Path], list[str]]
 """Draws into a folder; returns what it warned of, or why it failed: the numbers stand without pictures."""
 
@@ -57,18 +55,11 @@ def _group(module: str, *words: str | Path) -> Iterator[subprocess.Popen[str]]:
         start_new_session=True,
     )
     try:
-        _end_first(process.pid)
         yield process
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-
-
-def _end_first(process: int) -> None:
-    """Make Linux end this process, and those that it will start, before others where memory runs out."""
-    with suppress(OSError):  # another system, or the process has ended
-        Path(f"/proc/{process}/oom_score_adj").write_text(FIRST_TO_END)
 
 
 def _said(process: subprocess.Popen[str], told: str = "") -> list[str]:

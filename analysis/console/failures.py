@@ -20,7 +20,8 @@ import traceback
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-from analysis.console.interruption import Interrupted, ignore, raising
+from analysis.console.interruption import Interrupted
+from analysis.console.plain import OBEYED
 from landscape.errors import InputError, TooLittleMemory, lacks_memory, lacks_space
 
 LONGEST = 4000  # characters of a sentence; the list of all settings, the longest of our own, takes a third
@@ -39,7 +40,7 @@ def describe(error: BaseException) -> tuple[int, str]:
     >>> describe(ZeroDivisionError())[0]
     70
     """
-    text = " ".join(str(error).split())
+    text = " ".join(str(error).split()).translate(OBEYED)
     if len(text) > LONGEST:  # a damaged file's own words may be megabytes
         text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 4 :]}"
     if isinstance(error, Interrupted):
@@ -53,11 +54,11 @@ def describe(error: BaseException) -> tuple[int, str]:
     if lacks_memory(error):
         return NO_MEMORY, f"memory ran out; take fewer Gaussians or smaller images, or end other programs ({text})"
     if isinstance(error, OSError):
-        named = error.filename is not None and error.strerror is not None
+        named, name = error.filename is not None and error.strerror is not None, str(error.filename).translate(OBEYED)
         if lacks_space(error):
-            return FULL_DISK, f"the disk is full{f' ({error.filename})' if named else ''}; free space and run it again"
+            return FULL_DISK, f"the disk is full{f' ({name})' if named else ''}; free space and run it again"
         if named:
-            return BAD_INPUT, f"cannot use {error.filename}: {error.strerror}"
+            return BAD_INPUT, f"cannot use {name}: {error.strerror}"
     if isinstance(error, InputError) or (isinstance(error, OSError) and error.errno is None):  # in the program's words
         return BAD_INPUT, text
     return BUG, "this is a fault of the program; please report it with all of the above and what the command read"
@@ -78,10 +79,7 @@ def report(error: BaseException, command: Sequence[str], debug: bool = False) ->
 def program(main: Callable[[], int | None]) -> NoReturn:
     """The main function of a module that is run as a program: ends the process with its exit code, or that of its error."""
     try:
-        with raising():
-            code = main() or 0
+        code = main() or 0
     except (Exception, KeyboardInterrupt) as error:
         code = report(error, sys.orig_argv)
-    finally:
-        ignore()
     sys.exit(code)

@@ -1,153 +1,87 @@
-"""Ctrl-C, a scheduler's SIGTERM, a terminal that closes: what is under way is left in order, the exit code names the signal."""
+"""Ctrl-C, a scheduler's SIGTERM, a terminal that closes: a flag, at which long work looks between its stages and steps.
+
+Where nobody listens, and while libraries are loaded, a signal ends the process: what it writes is written whole or not at all.
+"""
 
 import os
 import signal
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from threading import Event, Timer, current_thread, main_thread
+from threading import Event, current_thread, main_thread
 from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-DEAF = "_unheard"  # how the names of our functions begin in which nothing may be raised
-DEAF_FILES = (
-    "<frozen importlib._bootstrap>",  # Python's own code that loads modules
-    os.path.join("llvmlite", "binding", "ffi.py"),  # LLVM's lock, and what LLVM calls while it compiles
-)
-LOCKING = ("__enter__", "__exit__", "acquire", "release")  # where a lock is held and nobody knows it yet, or any more
-AGAIN = 0.01  # seconds until a signal that came where nothing can be raised is sent again
+SAID = "ending after this step; another one ends it at once"
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal that interrupted what was under way."""
+    """The end of what looked at the flag.  exit_code: 128 + the number of the signal, as shells have it."""
 
     def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
-
-    def __str__(self) -> str:
-        return f"interrupted by {signal.Signals(self.number).name}"
-
-    @property
-    def exit_code(self) -> int:
-        """128 + its number, as shells have it."""
-        return 128 + self.number
+        super().__init__(f"interrupted by {signal.Signals(number).name}")
+        self.exit_code = 128 + number
 
 
 class Interruption(Event):
-    """Set by the first signal.  exit_code: for a command that it ended."""
+    """The flag.  number: of the signal that set it."""
 
-    exit_code = 0
+    number = 0
 
-
-@contextmanager
-def raising() -> Iterator[None]:
-    """Signals raise `Interrupted` wherever the main thread is, so that what it has begun is cleaned up.
-
-    Where Python drops what is raised, in finalizers and what C calls, while a library is loaded, whose C may end the
-    process for it, and as a lock is taken, which another thread would wait for without end, the signal is sent again
-    until it is heard, or the block ends.  An error after it stands for it.
-    """
-    raised, waiting = list[Interrupted](), list[tuple[Timer, int]]()
-
-    def send_again(number: int) -> None:
-        timer = Timer(AGAIN, os.kill, (os.getpid(), number))
-        waiting.append((timer, number))
-        timer.daemon = True
-        timer.start()
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        if _is_deaf(frame):
-            return send_again(number)
-        raised.append(Interrupted(number))
-        raise raised[-1]
-
-    def dropped(found: Any) -> None:
-        if isinstance(found.exc_value, Interrupted):
-            send_again(found.exc_value.number)
-        else:
-            before(found)
-
-    before, sys.unraisablehook = sys.unraisablehook, dropped
-    try:
-        with _handled(interrupt):
-            try:
-                yield
-            finally:
-                late = [number for timer, number in waiting if timer.is_alive()]
-                for timer, _ in waiting:
-                    timer.cancel()
-            if late:
-                raise Interrupted(late[-1])
-    except Exception as error:
-        if raised:
-            raise raised[-1] from error
-        raise
-    finally:
-        sys.unraisablehook = before
+    @property
+    def exit_code(self) -> int:
+        """For a command that the signal ended; 0 without one."""
+        return 128 + self.number if self.is_set() else 0
 
 
-def _is_deaf(frame: FrameType | None) -> bool:
-    """Whether nothing may be raised in what the frame runs, or what called it."""
-    if frame is not None and frame.f_code.co_name in LOCKING:
-        return True
-    while frame is not None:
-        if frame.f_code.co_name.startswith(DEAF) or frame.f_code.co_filename.endswith(DEAF_FILES):
-            return True
-        frame = frame.f_back
-    return False
-
-
-def end_at_once() -> None:
-    """A signal ends the process from now on, in a line: while libraries are loaded there is nothing to leave in order."""
-
-    def end(number: int, _: FrameType | None) -> None:
-        with suppress(OSError):
-            os.write(2, f"landscape: {Interrupted(number)}\n".encode())
-        os._exit(Interrupted(number).exit_code)
-
-    _for_good(end)
-
-
-def ignore() -> None:
-    """Signals change nothing from now on: the work is done."""
-    _for_good(signal.SIG_IGN)
-
-
-def _for_good(handler: "Callable[[int, FrameType | None], None] | signal.Handlers") -> None:
-    for each in SIGNALS:
-        if signal.getsignal(each) is not signal.SIG_IGN:
-            signal.signal(each, handler)
+_flag: Interruption | None = None  # of the command that listens
 
 
 @contextmanager
 def interruption() -> Iterator[Interruption]:
-    """The first signal only sets the event, so that what is under way ends; a second one does what it did before."""
-    event = Interruption()
+    """Listen in the block: the first signal sets the flag, also of a block within; a second one does what it did before."""
+    global _flag
+    if _flag is not None or current_thread() is not main_thread():
+        yield _flag or Interruption()
+        return
 
     def first(number: int, _: FrameType | None) -> None:
-        event.exit_code = Interrupted(number).exit_code
-        event.set()
-        restore()
+        flag.number = number
+        flag.set()
+        _handle(before)
+        with suppress(OSError):
+            os.write(2, f"landscape: {signal.Signals(number).name}: {SAID}\n".encode())
 
-    with _handled(first) as restore:
-        yield event
+    flag = _flag = Interruption()
+    before = _handle(dict.fromkeys(SIGNALS, first))
+    try:
+        yield flag
+    finally:
+        _flag = None
+        _handle(before)
+
+
+def look() -> None:
+    """Raise Interrupted where the flag is set."""
+    if _flag is not None and _flag.is_set():
+        raise Interrupted(_flag.number)
 
 
 @contextmanager
-def _handled(handler: Callable[[int, FrameType | None], None]) -> Iterator[Callable[[], None]]:
-    """Handle the signals in the block, but for those that are ignored, as under nohup; gives what ends it earlier."""
-    before = {each: signal.getsignal(each) for each in SIGNALS} if current_thread() is main_thread() else {}
-
-    def restore() -> None:
-        for each, old in before.items():
-            signal.signal(each, signal.SIG_DFL if old is None else old)  # None: a handler that is none of Python's
-
-    for each, old in before.items():
-        if old is not signal.SIG_IGN:
-            signal.signal(each, handler)
+def loading() -> Iterator[None]:
+    """Signals end the process in the block, in which libraries are loaded: their C drops what Python raises, and pycolmap
+    takes SIGTERM for itself."""
+    before = _handle(dict.fromkeys(SIGNALS, signal.SIG_DFL)) if current_thread() is main_thread() else {}
     try:
-        yield restore
+        yield
     finally:
-        restore()
+        _handle(before)
+
+
+def _handle(handlers: dict[signal.Signals, Any]) -> dict[signal.Signals, Any]:
+    """Handle signals so, but for those that are ignored, as under nohup; returns how they were handled."""
+    before = {each: signal.getsignal(each) for each in handlers}
+    for each, handler in handlers.items():
+        if before[each] is not signal.SIG_IGN:
+            signal.signal(each, signal.SIG_DFL if handler is None else handler)  # None: one that is none of Python's
+    return before

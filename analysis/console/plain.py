@@ -1,6 +1,12 @@
-"""Lines of a command in the terminal, as they are: paths and names may hold what rich reads as markup."""
+"""Lines of a command in the terminal, as they are: paths and names may hold what rich reads as markup, or a terminal obeys."""
 
+from rich import control
 from rich.console import Console
+
+OBEYED = dict.fromkeys(
+    [*range(9), *range(11, 32), *range(127, 160)], "\N{REPLACEMENT CHARACTER}"
+)  # by a terminal, of a text
+control._CONTROL_STRIP_TRANSLATE |= OBEYED  # of all that rich prints, which takes a few of them away by itself
 
 
 def say(*lines: str, console: Console | None = None, style: str | None = None) -> None:

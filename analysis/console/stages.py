@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
+from analysis.console.interruption import look
 from analysis.console.plain import say
 from landscape.results import Progress as Report
-from splat.backend.memory import require_room
 
 Stage = Callable[[str], AbstractContextManager[Report]]
 NOW_AND_THEN = 15.0  # seconds between lines off a terminal
@@ -83,13 +83,14 @@ class Stages:
     def stage(self, name: str) -> Iterator[Report]:
         """Time the block; call what it gives with the units done, the most there can be, and a few words.
 
-        TooLittleMemory where limits of the process leave no room to begin.
+        Interrupted, at its begin and where it is called, once a signal has come.
         """
-        require_room()
+        look()
         task = self._progress.add_task(name, total=None, state="")
         start = perf_counter()
 
         def report(done: int, most: int, state: str) -> None:
+            look()
             spent = perf_counter() - start
             words = f"{done} of at most {most}{pace(done, spent)}{self.left(name, spent, done)}"
             self._progress.update(task, completed=done, total=most, state=f"{words}; {state}")

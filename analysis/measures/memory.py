@@ -9,7 +9,7 @@ import torch
 
 from landscape import EigenSettings
 from landscape.errors import InputError, TooLittleMemory, lacks_memory
-from splat.backend.memory import RESERVE, SLACK, free_memory, is_told, memory_left, require_room, resident_memory
+from splat.backend.memory import SLACK, free_memory, is_told, resident_memory
 from splat.curvature.linearize import VECTORS, KeptViews
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
@@ -48,19 +48,18 @@ def size_of(text: str | None) -> int | None:
 
 def require_pictures(frames: Sequence[Frame], gaussians: Gaussians) -> None:
     """TooLittleMemory that says what would fit, where pictures and Gaussians alone take more than is free."""
-    require_room(RESERVE)
     each = [PICTURES * 4 * frame.camera.width * frame.camera.height for frame in frames]
-    fixed, left = COPIES * gaussians.flat.nbytes, memory_left(torch.device("cpu"))
+    fixed, left = COPIES * gaussians.flat.nbytes, free_memory(torch.device("cpu"))
     if fixed + sum(each) <= left:
         return
     some = (left - fixed) // max(each)
     raise TooLittleMemory(
-        f"expected {_gb(fixed + sum(each))} of memory beside what is taken, for {len(frames)} pictures and "
-        f"{len(gaussians):,} Gaussians, got {_gb(max(left, 0))}; "
+        f"expected {_size(fixed + sum(each))} of memory beside what is taken, for {len(frames)} pictures and "
+        f"{len(gaussians):,} Gaussians, got {_size(left)}; "
         + (
             f"--max-views {some} would fit"
             if some > 0
-            else f"allow or free at least {_gb(fixed + sum(each) - left)} more"
+            else f"allow or free at least {_size(fixed + sum(each) - left)} more"
         )
     )
 
@@ -68,27 +67,32 @@ def require_pictures(frames: Sequence[Frame], gaussians: Gaussians) -> None:
 def expected_peak(objective: SceneObjective) -> int:
     """About the most that a probe takes at a time, in bytes.  TooLittleMemory that says what would fit, where less is
     free."""
-    require_room(RESERVE)
     needs, device = objective.needs, objective.active.flat.device
-    free, used = memory_left(device), resident_memory() if device.type == "cpu" else 0
+    free, used = free_memory(device), resident_memory() if device.type == "cpu" else 0
     least, camera = needs.view + needs.beside, objective.views[0].camera
     if least > free:
-        fit = int(len(objective.active) * max(free, 0) / least)
+        fit = int(len(objective.active) * free / least)
         enough = (
             f"--memory {ceil((used + least) / (1 - SLACK) / 1e7) / 100:g}GB"
             if is_told()
-            else f"{_gb(least - free + 5e6)} more"
+            else f"{_size(least - free)} more"
         )
         raise TooLittleMemory(
-            f"expected at least {_gb(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
-            f"{camera.width} x {camera.height} px, got {_gb(used + max(free, 0))}, of which {_gb(used)} are taken; "
+            f"expected at least {_size(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
+            f"{camera.width} x {camera.height} px, got {_size(used + free)}, of which {_size(used)} are taken; "
             f"{enough} would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
         )
     return used + min(free, len(objective.views) * needs.view + needs.beside)
 
 
-def _gb(size: float) -> str:
-    return f"{size / 1e9:.2f} GB"
+def _size(size: float) -> str:
+    """Bytes in words, to three digits.
+
+    >>> _size(0), _size(1234), _size(2.5e9)
+    ('0 kB', '1.23 kB', '2.5 GB')
+    """
+    unit, name = next(((each, name) for each, name in ((1e9, "GB"), (1e6, "MB")) if size >= each), (1e3, "kB"))
+    return f"{size / unit:.3g} {name}"
 
 
 @contextmanager

@@ -85,7 +85,7 @@ def steepest(
     pictures, difference = _pictures(objective, view, places, crop)
     found = Steepest(
         name=end.name, curvature=end.curvature, participation=spread, carriers=carriers, view=view.name,
-        crop=list(crop), step=steps[best], losses=[pairs[best][0], loss, pairs[best][1]], difference=difference, file=file,
+        crop=crop, step=steps[best], losses=(pairs[best][0], loss, pairs[best][1]), difference=difference, file=file,
         steps=steps, factors=factors, rendered=rendered_sentence(end, loss, steps, factors),
         sentence=sentence(end, carriers, spread, view, len(objective.views)),
     )  # fmt: skip

@@ -16,7 +16,7 @@ from analysis.measures.gradient_check import ENOUGH
 from analysis.measures.localization import conditions, localize, mass_shares
 from analysis.probe.measured import LeftOut, Measured, PlaneSlice
 from analysis.records import schema
-from analysis.records.provenance import Provenance, provenance
+from analysis.records.provenance import Origin, Provenance, provenance
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
 from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, literal
@@ -97,7 +97,7 @@ def provenance_of(
         made.question["seed"],
         lanes=lanes_of(np.float32),
         checkpoint=str(path),
-        origin=UNSET if checkpoint.origin is None else checkpoint.origin,
+        origin=UNSET if checkpoint.origin is None else convert(checkpoint.origin, Origin),
         scene=scene.name,
         scene_folder=str(scene.root),
         views=list(checkpoint.scene.train),

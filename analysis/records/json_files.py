@@ -7,6 +7,7 @@ protobuf's JSON), and comes back as a float.  A field that is UNSET is left out.
 import json
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,6 +15,7 @@ import msgspec
 import numpy as np
 
 from landscape.errors import InputError
+from splat.model import untrusted
 
 T = TypeVar("T")
 NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
@@ -31,10 +33,15 @@ def read_json(path: Path, kind: type[T], what: str, remedy: str) -> T:
 
 def plain_json(path: Path, what: str, remedy: str) -> Any:
     """A file's content as plain types.  InputError where it is no JSON."""
+    return decoded(with_remedy(f"it should be {what}; {remedy}", untrusted.read_json, path))
+
+
+def with_remedy(remedy: str, read: Callable[[Path], T], path: Path) -> T:
+    """What a reader makes of a file; its InputError says what to do too."""
     try:
-        return decoded(msgspec.json.decode(path.read_bytes()))
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"expected {what} in {path}, got a damaged file ({error}); {remedy}") from None
+        return read(path)
+    except InputError as error:
+        raise InputError(f"{error}; {remedy}") from None
 
 
 def fitted(data: Any, kind: type[T], where: str, remedy: str) -> T:

@@ -6,11 +6,11 @@ import platform
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from msgspec import UNSET, Struct
+from msgspec import UNSET, Meta, Struct
 
-from analysis.records.schema import Maybe
+from analysis.records.schema import Maybe, NonNegative, Number
 from landscape.errors import InputError
 from splat.training.origin.fingerprint import Fingerprint
 
@@ -24,6 +24,46 @@ class Machine(Struct, kw_only=True):
     cores: int | None = None
     lanes: int | None = None
     system: str = ""
+
+
+class Loss(Struct, kw_only=True):
+    """`LossSettings` as they are written."""
+
+    pixel: str = "l1"
+    ssim_weight: float = 0.2
+    eps: float = 0.01
+    literal: bool = False
+    border: str = "padded"
+    opacity_reg: NonNegative = 0.0
+    scale_reg: NonNegative = 0.0
+
+
+class Conventions(Struct, kw_only=True):
+    """Those of a trainer, as `splat.training.origin.presets.Preset` has them; render: `RenderSettings`."""
+
+    render: dict[str, bool | int | float | str | None]
+    loss: Loss
+    world: str = "scene"
+    centred: bool = False
+    widest: int | None = None
+    antialias: str = "none"
+    antialiased_blur: float | None = None
+    different: list[str] = []
+
+
+class Origin(Struct, kw_only=True):
+    """What was assumed of another tool's file (`splat.training.origin.foreign`).  views: how they were found, in words."""
+
+    trained_by: str
+    images: str | None
+    downscale: Annotated[float, Meta(gt=0)]
+    preset: Conventions
+    format: str = ""
+    trained_by_source: str = ""
+    views: str = ""
+    notes: list[str] = []
+    psnr: Number = None
+    similarity: list[list[float]] | None = None
 
 
 class Provenance(Struct, kw_only=True):
@@ -40,7 +80,7 @@ class Provenance(Struct, kw_only=True):
     machine: Machine
     commit: Maybe[str | None] = UNSET
     checkpoint: Maybe[str] = UNSET
-    origin: Maybe[dict[str, Any]] = UNSET
+    origin: Maybe[Origin] = UNSET
     other: Maybe[str | None] = UNSET
     scene: Maybe[str] = UNSET
     scene_folder: Maybe[str] = UNSET

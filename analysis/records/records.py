@@ -8,25 +8,21 @@
 `record_folder` makes the whole folder appear at once.  Needs no torch.
 """
 
-import glob
-import os
-import shutil
-import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Generic, TypeVar, cast
+from typing import Any, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
 from msgspec import UNSET, Struct, field
 
 from analysis.records import schema
-from analysis.records.json_files import decoded, encoded, fitted, json_text, plain, plain_json
+from analysis.records.json_files import decoded, encoded, fitted, json_text, plain, plain_json, with_remedy
 from analysis.records.provenance import Provenance
 from analysis.records.schema import Count, Maybe, Number
 from landscape.errors import InputError
-from splat.model.untrusted import beside, locked, replacing, require_held, require_modest
+from splat.model.untrusted import beside, locked, read_arrays, replacing, write_atomically
 
 ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
@@ -49,7 +45,7 @@ slice         x, y: increasing steps along the directions; loss: L on the grid, 
               centre; false, as not known, where interpolated
 directions    of a `landscape slice`: its directions as columns, of the Gaussians in sight or, for a line, of all
 """
-BOOLEAN = {"evaluated", "crossed"}
+BOOLEAN, POSITIVE = {"evaluated", "crossed"}, {"residuals", "weights"}
 PHOTOGRAPH, RENDER = "view-{:03d}-photograph.jpg", "view-{:03d}-render.jpg"
 
 
@@ -82,6 +78,13 @@ class Counts(Struct, kw_only=True):
     views_kept_linearised: Maybe[Count] = UNSET
     products: Count = 0
     renders: Count = 0
+
+    def __post_init__(self) -> None:
+        schema.require_order(visible_gaussians=self.visible_gaussians, gaussians=self.gaussians)
+        schema.require_order(active_parameters=self.active_parameters, parameters=self.parameters)
+        schema.require_order(rank=self.rank, active_parameters=self.active_parameters)
+        schema.require_order(views=self.views, views_of=self.views_of)
+        schema.require_order(sh_degree_active=self.sh_degree_active, sh_degree_stored=self.sh_degree_stored)
 
 
 class Check(Struct, kw_only=True):
@@ -177,34 +180,13 @@ class Record(Generic[Data]):
 def record_folder(folder: str | Path, mark: str = ProbeRecord.FILE) -> Iterator[Path]:
     """A new, empty folder that becomes `folder` when the block ends, all at once; nothing changes if the block fails.
 
-    mark: the file that every record of this kind has; an old record at `folder` is replaced.  After a kill at any point,
-    `folder` is the old record, the new one, or (between two renames) absent, with the old one in `.NAME.previous` beside it,
-    which the next use restores.
+    mark: the file that every record of this kind has; an old record at `folder` is replaced.
     """
     folder = Path(folder).resolve()  # a link stays one
     require_replaceable(folder, mark)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    previous = folder.with_name(f".{folder.name}.previous")
-    with locked(beside(folder), f"no other command that writes {folder}"):
-        _clean_up_after_kills(folder, previous)
-        partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
-        try:
-            partial.mkdir()  # within try, as a signal may arrive before the next statement
-            yield partial
-            for file in (path for path in partial.rglob("*") if path.is_file()):
-                with file.open("rb") as stream:
-                    os.fsync(stream.fileno())
-            if folder.exists():
-                folder.rename(previous)
-            partial.rename(folder)
-        except BaseException as error:
-            _remove(partial)
-            if previous.exists() and not folder.exists():
-                previous.rename(folder)
-            if isinstance(error, OSError) and error.errno and error.filename is None:
-                error.filename = str(folder)  # the error of a full disk lacks it
-            raise
-        _remove(previous)
+    with locked(beside(folder), f"no other command that writes {folder}"), replacing(folder, folder=True) as partial:
+        yield partial
 
 
 def write_record(folder: str | Path, data: ProbeRecord | SliceRecord, arrays: Mapping[str, Mapping[str, Any]]) -> Path:
@@ -228,8 +210,7 @@ def write_data(folder: str | Path, data: ProbeRecord | SliceRecord) -> Path:
     content = encoded(plain(data))
     fitted(decoded(content), type(data), "a record that cannot be read again", "")
     path = Path(folder) / data.FILE
-    with replacing(path) as partial:
-        partial.write_text(json_text(content), encoding="utf-8")
+    write_atomically(path, json_text(content).encode())
     return path
 
 
@@ -270,36 +251,13 @@ def _read_arrays(folder: Path, group: str, shapes: Mapping[str, list[int]], agai
     shapes = {name: shape for name, shape in shapes.items() if name in ARRAYS[group] or "*" in ARRAYS[group]}
     if not path.is_file():
         raise FileNotFoundError(f"expected the arrays of the record in {path}, got no such file; {again}")
-    with path.open("rb") as stream, refusing_damage("arrays", path, again), _archive(stream) as archive:
-        arrays = {name: archive[name] for name in shapes if name in archive.files}
+    found = with_remedy(again, read_arrays, path)
+    arrays = {name: found[name] for name in shapes if name in found}
     try:
         _require_arrays(group, arrays, shapes)
     except ValueError as error:
         raise InputError(f"expected the arrays of the record in {path}, got {error}; {again}") from None
     return arrays
-
-
-def _archive(stream: BinaryIO) -> Any:
-    """The arrays of an .npz, each read on access, after a check of their sizes."""
-    with zipfile.ZipFile(stream) as archive:
-        require_modest(archive)
-        for member in archive.infolist():
-            if member.filename.endswith(".npy"):
-                with archive.open(member) as file:
-                    require_held(cast(BinaryIO, file), member.file_size)
-    stream.seek(0)
-    return np.load(stream, allow_pickle=False)
-
-
-@contextmanager
-def refusing_damage(what: str, path: Path, remedy: str) -> Iterator[None]:
-    """Turn every error but MemoryError into an InputError that names the file: numpy and zipfile may raise nearly anything."""
-    try:
-        yield
-    except MemoryError:
-        raise
-    except Exception as error:
-        raise InputError(f"expected {what} in {path}, got a damaged file ({error}); {remedy}") from None
 
 
 def _require_arrays(group: str, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, list[int]]) -> None:
@@ -309,12 +267,12 @@ def _require_arrays(group: str, arrays: Mapping[str, np.ndarray], shapes: Mappin
         if name not in arrays:
             raise ValueError(f"no {name}")
         array, kind = arrays[name], "boolean" if name in BOOLEAN else "floating"
-        if not isinstance(array, np.ndarray):  # of a member that is no .npy, numpy returns the bytes
-            raise ValueError(f"no array as {name}")
         if array.shape != tuple(shape):
             raise ValueError(f"{name} of shape {list(array.shape)} instead of {shape}")
         if not np.issubdtype(array.dtype, np.bool_ if name in BOOLEAN else np.floating):
             raise ValueError(f"{name} of {array.dtype} instead of {kind} values")
+        if name in POSITIVE and not (array >= 0).all():
+            raise ValueError(f"{name} below 0, or not a number")
     for name, axes in ARRAYS[group].items():
         if name == "*" or (name not in arrays and axes.endswith("?")):
             continue
@@ -346,18 +304,3 @@ def require_replaceable(folder: Path, mark: str = ProbeRecord.FILE) -> None:
         )
     if folder.exists() and not folder.is_dir():
         raise InputError(f"expected a folder to write a record to, got the file {folder}; move it away")
-
-
-def _clean_up_after_kills(folder: Path, previous: Path) -> None:
-    """Remove what killed commands left: under our lock, no partial folder belongs to a command that runs."""
-    if folder.exists():  # else `previous` is the only record there is
-        _remove(previous)
-    for partial in folder.parent.glob(f".{glob.escape(folder.name)}.partial-*"):
-        _remove(partial)
-
-
-def _remove(folder: Path) -> None:
-    if folder.is_symlink():
-        folder.unlink()
-    else:
-        shutil.rmtree(folder, ignore_errors=True)

@@ -35,11 +35,12 @@ from analysis.records.json_files import plain
 from analysis.records.provenance import Provenance
 from analysis.records.quantities import exponent_of, limits, measured, percent, quantity, ratio, unit_suffix
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
-from analysis.records.run_files import MAP, MapRecord, Steepest, read_map
+from analysis.records.run_files import MAP, MapRecord, Steepest, read_map, read_maps
 from analysis.records.schema import INDICES
 from analysis.records.tables import bracketed, family_lines
 from figures.eye import eye_over
-from splat.model.untrusted import replacing
+from landscape.errors import InputError
+from splat.model.untrusted import read_picture, write_atomically
 
 FILE, SPLATS = "report.html", "view.html"  # in the record's folder, and beside it: the page of `landscape view --html`
 FINE, COARSE = 82, 60  # quality of WebP: of drawings, and of maps, which are noisy
@@ -67,8 +68,7 @@ def write_report(folder: str | Path) -> Path:
     """
     record = read_record(folder, ProbeRecord)
     path = record.folder / FILE
-    with replacing(path) as partial:
-        partial.write_text(render_report(record), encoding="utf-8")
+    write_atomically(path, render_report(record).encode())
     return path
 
 
@@ -96,9 +96,17 @@ def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environ
 
 
 def render_report(record: Record[ProbeRecord]) -> str:
-    """The page as text.  Pictures and plotly.js are compressed in parallel."""
+    """The page as text.  A damaged map beside the record costs it the map's pictures alone, and is said."""
+    try:
+        return _page(record, map_beside(record), findings(record.data))
+    except InputError as error:
+        return _page(record, None, [Line(f"The map is left out: {error}.", "caution"), *findings(record.data)])
+
+
+def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line]) -> str:
+    """Pictures and plotly.js are compressed in parallel."""
     data, run = record.data, record.folder.parent
-    surface, mapped = interactive_surface(record), map_beside(record)
+    surface = interactive_surface(record)
     first = opening(data, mapped)
     captions = PICTURES | ({"traces": COMPARED} if shares_per_trace(data) else {})
     with ThreadPoolExecutor() as pool:
@@ -118,7 +126,7 @@ def render_report(record: Record[ProbeRecord]) -> str:
         subtitle=subtitle(data),
         numbers=numbers(data, mapped),
         headline=first,
-        findings=findings(data),
+        findings=said,
         views=views,
         listed_views=listed,
         start=start,
@@ -247,8 +255,8 @@ def views_in(record: Record[ProbeRecord], mapped: MapRecord | None) -> list[dict
     pairs = [(folder / PHOTOGRAPH.format(i), folder / RENDER.format(i)) for i in range(len(names))]
     drawn = [i for i, pair in enumerate(pairs) if all(path.is_file() for path in pair)]
     maps = record.folder.parent / MAP
-    panels = {panel.place: maps / f"{panel.file}.npz" for panel in (mapped.panels if mapped else [])}
-    panels = {place: path for place, path in panels.items() if path.is_file() and place in drawn}
+    panels = {panel.place: panel.file for panel in (mapped.panels if mapped else []) if panel.place in drawn}
+    panels = {place: file for place, file in panels.items() if (maps / f"{file}.npz").is_file()}
     views = []
     for i in sorted(panels) or drawn:
         pictures = [
@@ -256,12 +264,13 @@ def views_in(record: Record[ProbeRecord], mapped: MapRecord | None) -> list[dict
             for words, path in zip(("photograph", "render"), pairs[i])
         ]
         if mapped and panels:
-            with np.load(panels[i], allow_pickle=False) as arrays:
-                for shade in (mapped.shades[mapped.field], mapped.shades["error"]):
-                    coloured = Image.fromarray(shade.palette[arrays[shade.name]])
-                    coloured.thumbnail(Image.open(pairs[i][0]).size)
-                    uri = picture_uri(coloured, COARSE)
-                    pictures.append({"words": shade.title, "uri": uri, "legend": shade.legend})
+            shades = {name: mapped.shades[name] for name in (mapped.field, "error")}
+            arrays = read_maps(maps, panels[i], shades)
+            for name, shade in shades.items():
+                coloured = Image.fromarray(shade.palette[arrays[name]])
+                coloured.thumbnail(read_picture(pairs[i][0]).size)
+                uri = picture_uri(coloured, COARSE)
+                pictures.append({"words": shade.title, "uri": uri, "legend": shade.legend})
         views.append({"name": names[i], "pictures": pictures})
     return views
 
@@ -303,7 +312,7 @@ def carriers_in_words(end: Steepest) -> str:
 
 def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:
     """A picture as a data URI; WebP takes a quarter of the bytes of PNG."""
-    content, image = io.BytesIO(), Image.open(picture) if isinstance(picture, Path) else picture
+    content, image = io.BytesIO(), read_picture(picture) if isinstance(picture, Path) else picture
     image.convert("RGB").save(content, "WEBP", quality=quality, method=EFFORT)
     return data_uri(content.getvalue(), "webp")
 

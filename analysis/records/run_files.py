@@ -10,17 +10,20 @@ What is damaged is refused by the name of the file, with what to do.  Needs no t
 """
 
 import reprlib
+from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from msgspec import Struct
+import numpy as np
+from msgspec import Meta, Struct
 
 from analysis.records.findings import ATTRIBUTES
-from analysis.records.json_files import read_json
+from analysis.records.json_files import read_json, with_remedy
 from analysis.records.provenance import Machine, Provenance
 from analysis.records.quantities import Shade
-from analysis.records.schema import INDICES, Count, Number
+from analysis.records.schema import INDICES, Count, NonNegative, Number, Portion
 from landscape.errors import InputError
+from splat.model.untrusted import NAME, read_arrays
 from splat.training.origin.fingerprint import Fingerprint
 
 if TYPE_CHECKING:
@@ -42,6 +45,9 @@ NUMBERS = (  # more of them, empty where not determined; others may be there too
     *(f"{name}{part}" for name in ENDS for part in ("", "_error")),
     *(f"{name}{part}" for name in TRAJECTORY_INDICES for part in ("", "_low", "_high")),
 )
+VIEW_MAPS = ("photograph", "render")  # pictures of a `Panel`, beside the shades of the record
+END_MAPS = ("view", "photograph", "minus", "zero", "plus", "difference")  # those of a `Steepest`
+FileName = Annotated[str, Meta(pattern=NAME)]  # without its suffix
 _TRAJECTORY = "the records of landscape train --probe-every"
 
 
@@ -108,7 +114,7 @@ class Panel(Struct, kw_only=True):
 
     name: str
     place: Count
-    file: str
+    file: FileName
     psnr: Number
 
 
@@ -122,14 +128,14 @@ class Carrier(Struct, kw_only=True):
     """
 
     gaussian: Count
-    share: float
-    attributes: dict[str, float]
-    sigmas: list[float]
+    share: Portion
+    attributes: dict[str, Portion]
+    sigmas: Annotated[list[NonNegative], Meta(min_length=3, max_length=3)]
     aspect: float
-    opacity: float
+    opacity: Portion
     views: Count
-    one_view: float
-    outline: list[float]
+    one_view: Portion
+    outline: Annotated[list[float], Meta(min_length=5, max_length=5)]
 
 
 class Steepest(Struct, kw_only=True):
@@ -145,15 +151,15 @@ class Steepest(Struct, kw_only=True):
     name: str
     curvature: float
     participation: float
-    carriers: list[Carrier]
+    carriers: Annotated[list[Carrier], Meta(min_length=1)]
     view: str
-    crop: list[Count]
-    step: float
-    losses: list[float]
+    crop: tuple[Count, Count, Count, Count]
+    step: NonNegative
+    losses: tuple[float, float, float]
     steps: list[float] = []
     factors: list[float] = []
     difference: Shade
-    file: str
+    file: FileName
     sentence: str
     rendered: str = ""
 
@@ -221,6 +227,12 @@ class MapRecord(Struct, kw_only=True):
     provenance: Provenance
     timing: dict[str, float] = {}
 
+    def __post_init__(self) -> None:
+        if missing := sorted({self.field, "error"} - self.shades.keys()):
+            raise ValueError(f"Expected a shade of {missing[0]}, got {', '.join(self.shades) or 'none'}")
+        if self.seen > self.gaussians:
+            raise ValueError(f"Expected at most {self.gaussians} Gaussians as `seen`, got {self.seen}")
+
 
 def read_scores(run: Path) -> Scores:
     remedy = "remove it and repeat the training's command with --resume, which scores again"
@@ -234,6 +246,21 @@ def read_seconds(run: Path) -> Seconds:
 
 def read_map(folder: Path) -> MapRecord:
     return read_json(folder / MapRecord.FILE, MapRecord, "a record of `landscape map`", "map again")
+
+
+def read_maps(folder: Path, file: str, names: Collection[str]) -> dict[str, np.ndarray]:
+    """The pictures of these names in a file of a map, in bytes, (h, w) or (h, w, 3).  InputError where one is none."""
+    path = folder / f"{file}.npz"
+    maps = with_remedy("map again", read_arrays, path)
+    for name in names:
+        found = maps.get(name)
+        if found is None or found.dtype != np.uint8 or found.ndim not in (2, 3) or found.shape[2:] not in ((), (3,)):
+            kind = "none" if found is None else f"{found.dtype} of shape {found.shape}"
+            raise InputError(f"expected a picture in bytes as {name} in {path}, got {kind}; map again")
+    sizes = {maps[name].shape[:2] for name in names if name not in ("view", "difference")}
+    if len(sizes) > 1 or 0 in min(sizes):
+        raise InputError(f"expected pictures of one size in {path}, got {sorted(sizes)}; map again")
+    return {name: maps[name] for name in names}
 
 
 def read_comparison(folder: Path) -> Comparison:

@@ -12,6 +12,7 @@ Keys of a file that are not fields are ignored; a file of another version of its
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Annotated, Generic, Literal, TypeVar
 
 from msgspec import UNSET, Meta, Struct, UnsetType
@@ -25,9 +26,23 @@ Operator = Literal["hessian", "gauss-newton"]
 IndexName = Literal["literal", "saddle", "share", "effective_rank"]
 
 
+ROUND_OFF = 1e-6  # by which numbers may leave their order or [0, 1]
+NonNegative = Annotated[float, Meta(ge=0)]
+Portion = Annotated[float, Meta(ge=-ROUND_OFF, le=1 + ROUND_OFF)]
+
+
 def _require_error(name: str, value: Number) -> None:
     if value is not None and value < 0:
         raise ValueError(f"Expected `{name}` of at least 0, got {value}")
+
+
+def require_order(**values: "Number | Maybe[Number]") -> None:
+    """ValueError unless those that are known, and numbers, do not fall, but for round-off."""
+    known = [(name, value) for name, value in values.items() if isinstance(value, float | int) and value == value]
+    for (name, value), (other, next_value) in pairwise(known):
+        size = max(abs(value), abs(next_value))
+        if value > next_value + (ROUND_OFF * size if math.isfinite(size) else 0.0):
+            raise ValueError(f"Expected `{name}` of at most `{other}`, {next_value}, got {value}")
 
 
 class Named(Struct, Generic[T]):
@@ -52,6 +67,10 @@ class Objective(Struct, kw_only=True):
     value: Number = None
     gradient_norm: Number = None
     views_error: Maybe[Number] = UNSET
+
+    def __post_init__(self) -> None:
+        _require_error("value", self.value)
+        _require_error("gradient_norm", self.gradient_norm)
 
 
 class TraceOf(Struct, kw_only=True):
@@ -81,6 +100,7 @@ class TraceOf(Struct, kw_only=True):
 
     def __post_init__(self) -> None:
         _require_error("standard_error", self.standard_error)
+        require_order(low=self.low, value=self.value, high=self.high)
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -123,13 +143,13 @@ class LivesOn(Struct, kw_only=True):
     needle_bare_count: the number of those.  heaviest: (index, share) of single Gaussians, the largest share first.
     """
 
-    attributes: dict[str, float] = {}
+    attributes: dict[str, Portion] = {}
     participation: Number
-    needles: float
-    needles_bare: Number = None
+    needles: Portion
+    needles_bare: Portion | None = None
     needle_count: Count
     needle_bare_count: Count = 0
-    heaviest: list[tuple[int, float]] = []
+    heaviest: list[tuple[Count, Portion]] = []
 
 
 class End(Struct, kw_only=True):
@@ -162,7 +182,7 @@ class Eigenvalue(End, kw_only=True):
 
     matvecs: Count | None = None
     method: str = ""
-    shares: dict[str, float] = {}
+    shares: dict[str, Portion] = {}
     lives_on: Maybe[LivesOn] = UNSET
 
 
@@ -175,6 +195,10 @@ class Eigenvalues(Named[Eigenvalue], kw_only=True):
     power_max: Maybe[Eigenvalue] = UNSET
     power_min: Maybe[Eigenvalue] = UNSET
 
+    def __post_init__(self) -> None:
+        second = self.second.value if self.second else None
+        require_order(min=self.min.value, second=second, max=self.max.value)
+
 
 class Index(Struct, kw_only=True):
     """An index and its bracket.  value: None where undefined; low, high: None where unbounded."""
@@ -184,6 +208,11 @@ class Index(Struct, kw_only=True):
     high: Number
     note: str
 
+    def __post_init__(self) -> None:
+        """A bracket that leads through infinity, of a ratio whose denominator may be 0, lacks an end, or low is above high."""
+        if self.low is not None and self.high is not None and self.low <= self.high:
+            require_order(low=self.low, value=self.value, high=self.high)
+
 
 class Anisotropy(Named[Index], kw_only=True):
     """The indices of `landscape.spectrum.anisotropy`."""
@@ -192,6 +221,16 @@ class Anisotropy(Named[Index], kw_only=True):
     saddle: Maybe[Index] = UNSET
     share: Maybe[Index] = UNSET
     effective_rank: Maybe[Index] = UNSET
+
+    def __post_init__(self) -> None:
+        """All but `literal`, whose denominator may be 0, are in brackets; a share is one, a rank above 0."""
+        for name, found in self.items():
+            if name != "literal":
+                require_order(low=found.low, value=found.value, high=found.high)
+            if name in ("share", "effective_rank"):
+                _require_error(name, found.value)
+            if name == "share":
+                require_order(share=found.value, one=1.0)
 
 
 INDICES = Anisotropy.__struct_fields__
@@ -239,10 +278,10 @@ class Rise(Struct, kw_only=True):
     ratio_error: Number
     depth: Number
     depth_error: Number
-    depth_crossed: float
+    depth_crossed: Portion
     lateral: Number
     lateral_error: Number
-    lateral_crossed: float
+    lateral_crossed: Portion
 
 
 class DepthTraces(Struct, kw_only=True):
@@ -380,9 +419,15 @@ class Slice(Struct, kw_only=True):
     interpolation_error: Number = 0.0
     error_seen: Maybe[Number] = UNSET
     holdout_points: Count = 0
-    share_beyond: Number = None
+    share_beyond: Portion | None = None
     reason: str = ""
     note: Maybe[str] = UNSET
+
+    def __post_init__(self) -> None:
+        require_order(crossed_points=self.crossed_points, points=self.points)
+        require_order(evaluated_points=self.evaluated_points, points=self.points)
+        if self.resolved is False and self.evaluated_points is None:
+            raise ValueError("Expected `evaluated_points` of a plane that is not resolved, got none")
 
     @property
     def is_resolved(self) -> bool:

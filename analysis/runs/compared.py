@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from msgspec import UNSET
-
 from analysis.console.options import ForeignOptions
 from analysis.probe.command import opened, run_probe
 from analysis.probe.options import ProbeOptions
@@ -52,23 +50,23 @@ def compared(run: Path, options: CompareOptions) -> Checkpoint:
         return load_checkpoint(run / CHECKPOINT)
     folder = probe_folder(run)
     made = _made(folder)
-    if made and made.origin is not UNSET and (options.scene, options.foreign) == (None, ForeignOptions()):
+    if made and made.origin and made.scene_folder and (options.scene, options.foreign) == (None, ForeignOptions()):
         return open_checkpoint(run, _as_probed(made), folder.with_name(f"{folder.name}-mismatch.png"))
     return opened(run, options.scene, replace(options.foreign, max_views=None), folder)[0]
 
 
 def _as_probed(made: Provenance) -> Foreign:
-    assert made.origin is not UNSET and made.scene_folder is not UNSET
-    origin, loss = made.origin, made.origin["preset"]["loss"]
+    assert made.origin and made.scene_folder
+    origin, loss = made.origin, made.origin.preset.loss
     return Foreign(
         scene=Path(made.scene_folder),
         train_list=tuple(made.views or ()),
-        trained_by=origin["trained_by"],
-        images=origin["images"],
-        downscale=origin["downscale"],
-        antialiased=origin["preset"]["render"]["antialias"] != "none",
-        opacity_reg=loss["opacity_reg"],
-        scale_reg=loss["scale_reg"],
+        trained_by=origin.trained_by,
+        images=origin.images,
+        downscale=origin.downscale,
+        antialiased=origin.preset.render.get("antialias", "none") != "none",
+        opacity_reg=loss.opacity_reg,
+        scale_reg=loss.scale_reg,
     )
 
 

@@ -10,7 +10,6 @@ Eigenvectors and renders are kept in `.NAME.unfinished` beside the record until 
 command continues from them.  A line moves all Gaussians, also those that are in sight at one of its ends only.
 """
 
-import io
 import shlex
 import shutil
 from collections.abc import Sequence
@@ -36,7 +35,7 @@ from analysis.probe.record import provenance_of
 from analysis.records.findings import of_slice, resolved
 from analysis.records.provenance import require_seed
 from analysis.records.quantities import apart, measured, quantity
-from analysis.records.records import SliceRecord, record_folder, refusing_damage, require_replaceable
+from analysis.records.records import SliceRecord, record_folder, require_replaceable
 from analysis.records.schema import FiniteProbe
 from analysis.slice.directions import (
     RISE,
@@ -59,8 +58,8 @@ from splat.backend.memory import staying_within
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
-from splat.model.untrusted import read_array
-from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
+from splat.model.untrusted import KeptArrays
+from splat.training.checkpoint import Checkpoint, load_checkpoint
 from splat.training.origin.fingerprint import Fingerprint, state_of
 
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
@@ -155,14 +154,11 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
 
 def _known(probe: Path, unfinished: Path, made: Fingerprint, device: torch.device, notes: list[str]) -> list[Tensor]:
     """Eigenvectors of an interrupted run and of the probe.  notes: gets a sentence on those that cannot be read."""
-    kept, found = unfinished / "eigenvectors.npy", []
-    if kept.is_file():
-        try:
-            with kept.open("rb") as stream, refusing_damage("eigenvectors", kept, "they were computed again"):
-                vectors = torch.from_numpy(read_array(stream))
-            found.append(vectors.to(device))
-        except InputError as error:
-            notes.append(str(error))
+    found = []
+    try:
+        found += [torch.from_numpy(each).to(device) for each in _kept(unfinished).read().values()]
+    except InputError as error:
+        notes.append(f"{error}; they were computed again")
     if recorded := recorded_probe(probe, made, notes):
         vectors = torch.from_numpy(recorded.arrays["eigenvectors"]["largest"])
         found.append(vectors.to(device))
@@ -204,7 +200,7 @@ def _measure(
     ]
     loss = _evaluation(objective, settings.workers)
     digest = slice_digest(center, vectors, torch.cat(axes))
-    store = unfinished / f"{digest[:16]}.npz"
+    store = KeptArrays(unfinished / f"{digest[:16]}.npz")
     with stages.stage("slice") as report:
         found = evaluate_slice(
             loss, center, vectors, axes, gradient, true, settings, generators["holdout"], store, report
@@ -225,10 +221,11 @@ def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> Non
     vectors = [direction.vector.cpu().numpy() for direction in directions if direction.kind == "eigenvectors"]
     if not vectors:
         return
-    unfinished.mkdir(parents=True, exist_ok=True)
-    buffer = io.BytesIO()
-    np.save(buffer, np.stack(vectors, axis=1), allow_pickle=False)
-    write_atomically(unfinished / "eigenvectors.npy", buffer.getvalue())
+    _kept(unfinished).write(vectors=np.stack(vectors, axis=1))
+
+
+def _kept(unfinished: Path) -> KeptArrays:
+    return KeptArrays(unfinished / "eigenvectors.npz")
 
 
 def _evaluation(objective: SceneObjective, workers: int) -> Loss:

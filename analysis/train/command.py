@@ -19,7 +19,6 @@ The run folder appears at once, with its first checkpoint.
 
 import os
 import shlex
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -44,7 +43,7 @@ from landscape.errors import InputError, did_you_mean
 from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
 from splat.model.typed import leaves, typed
-from splat.model.untrusted import beside, locked
+from splat.model.untrusted import beside, locked, replacing
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, read_names, split_scene, usual_views
@@ -95,17 +94,10 @@ class Run:
 
     def create(self, *, keep_start: bool) -> None:
         """Create the folder with its first checkpoint, atomically.  keep_start: with a copy in START."""
-        partial = self.out.absolute().with_name(f".{self.out.name}.partial")
-        shutil.rmtree(partial, ignore_errors=True)  # of a killed run: no other has the lock
-        partial.mkdir()
-        try:
+        with replacing(self.out.absolute(), folder=True) as partial:
             save_checkpoint(partial / CHECKPOINT, self.training, self.reference)
             if keep_start:
                 self._save_within(partial / START)
-            os.rename(partial, self.out)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
 
     def save(self, spent: TrainingTime, *, stays: bool) -> None:
         """Write the checkpoint, time and history.  stays: also as a kept checkpoint; the oldest beyond `keep` are removed."""

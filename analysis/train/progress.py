@@ -21,7 +21,6 @@ from rich.text import Text
 
 from analysis.train.training_time import TrainingTime
 from landscape.errors import InputError
-from splat.backend.memory import require_room
 from splat.losses.autograd import view_loss
 from splat.losses.reference import psnr
 from splat.losses.regularizers import Regularizers
@@ -83,8 +82,7 @@ class TrainingProgress:
             self._row(spent)
 
     def after_step(self, done: StepResult, spent: TrainingTime) -> None:
-        """spent: in all steps so far.  TooLittleMemory where limits of the process leave no room to go on."""
-        require_room()
+        """spent: in all steps so far."""
         self.loss = done.loss if isnan(self.loss) else self.loss + SMOOTHING * (done.loss - self.loss)
         state = f"loss {self.loss:.4f} {done.gaussians} Gaussians"
         self.bars.update(self.bar, completed=done.step, state=state)

@@ -26,10 +26,10 @@ from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
 from analysis.train.training_time import TrainingTime
+from splat.model.untrusted import short, write_atomically
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.view import View
 from splat.scenes.write import bytes_of, png
-from splat.training.checkpoint import write_atomically
 from splat.training.origin.fingerprint import Fingerprint
 from splat.training.score.evaluate import Evaluation, ViewScore, evaluate
 from splat.training.score.perceptual import MissingPerceptual, load_lpips
@@ -84,9 +84,10 @@ def report(training: Training, views: Sequence[View], held_out: Sequence[View], 
 
 
 def render_name(view: str) -> str:
-    """File name of a view's render: `train/r_3` becomes `train_r_3.png`, `IMG_1.JPG` becomes `IMG_1.png`."""
+    """File name of a view's render: `train/r_3` becomes `train_r_3.png`, `IMG_1.JPG` becomes `IMG_1.png`; of a long name
+    its digest."""
     flat = Path(view.replace("/", "_"))
-    return f"{flat.stem if flat.suffix.lower() in IMAGE_SUFFIXES else flat.name}.png"
+    return f"{short(flat.stem if flat.suffix.lower() in IMAGE_SUFFIXES else flat.name)}.png"
 
 
 def render_names(views: Sequence[str]) -> dict[str, str]:

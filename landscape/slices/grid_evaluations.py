@@ -1,17 +1,16 @@
-"""Evaluations of an objective at points of a slice's grid: in parallel, and kept in a file so that a run can continue.
+"""Evaluations of an objective at points of a slice's grid: in parallel, and kept in a store so that a run can continue.
 
-The file holds a SHA-256 digest of (center, directions, coordinates) and the loss at the centre.  When it is read, the loss at
+The store holds a SHA-256 digest of (center, directions, coordinates) and the loss at the centre.  When it is read, the loss at
 the centre and the value that differs most from it are evaluated again and compared.  Values of another slice or of another
 objective are refused with an InputError.
 """
 
 import hashlib
-import os
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from math import isfinite
-from pathlib import Path
 from time import monotonic
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -24,6 +23,18 @@ from landscape.results import Progress
 Evaluation = float | Tensor | tuple[float | Tensor, Hashable]
 Loss = Callable[[Tensor], Evaluation]
 """loss(theta) -> the objective, or (the objective, smooth_piece): a label of the smooth piece that contains theta."""
+
+
+class Store(Protocol):
+    """Where evaluations are kept: writes all of the arrays or none, and reads them again, none before any were written.
+
+    Its text names it in messages.  Reading raises InputError where they are damaged.
+    """
+
+    def read(self) -> Mapping[str, np.ndarray]: ...
+
+    def write(self, **arrays: np.ndarray) -> None: ...
+
 
 SAVE_EVERY = 5.0  # seconds
 COLUMNS = {"points": "i", "values": "f", "crossed": "b"}  # of the file, with the kinds of their types
@@ -53,7 +64,7 @@ class GridEvaluations:
         directions: Float[Tensor, "n d"],
         points: Float64[Tensor, "p d"],
         workers: int = 1,
-        store: Path | None = None,
+        store: Store | None = None,
         progress: Progress | None = None,
     ):
         self._loss, self._center, self._points = loss, center.detach(), points.to(center.device)
@@ -66,7 +77,7 @@ class GridEvaluations:
         self.value, self.made = np.full(len(points), np.nan), 0
         self.known, self.discontinuous = np.zeros((2, len(points)), bool)
         self._digest = slice_digest(self._center, self._spans, points)
-        self._stored = self._read() if store is not None and store.exists() else {}
+        self._stored = self._read(store) if store is not None else {}
 
     def require(self, points: Iterable[int]) -> None:
         """Evaluate the points that are not known yet."""
@@ -107,42 +118,37 @@ class GridEvaluations:
         if self._progress:
             self._progress(int(self.known.sum()), len(self.known), "slice")
 
-    def _write(self, path: Path) -> None:
+    def _write(self, store: Store) -> None:
         values, crossed = zip(*self._stored.values(), strict=True) if self._stored else ((), ())
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        with temporary.open("wb") as stream:
-            np.savez(
-                stream,
-                digest=np.array(self._digest),
-                center_loss=np.array(self.center_loss),
-                has_signature=np.array(self.has_pieces),
-                points=np.array(list(self._stored), dtype=np.int64),
-                values=np.array(values, dtype=np.float64),
-                crossed=np.array(crossed, dtype=bool),
-            )
-        temporary.replace(path)
+        store.write(
+            digest=np.array(self._digest),
+            center_loss=np.array(self.center_loss),
+            has_signature=np.array(self.has_pieces),
+            points=np.array(list(self._stored), dtype=np.int64),
+            values=np.array(values, dtype=np.float64),
+            crossed=np.array(crossed, dtype=bool),
+        )
 
-    def _read(self) -> dict[int, tuple[float, bool]]:
-        assert self._store is not None
+    def _read(self, store: Store) -> dict[int, tuple[float, bool]]:
         advice = "name another file or delete this one"
         try:
-            with np.load(self._store, allow_pickle=False) as archive:
-                digest, center_loss = str(archive["digest"]), float(archive["center_loss"])
-                has_pieces = bool(archive["has_signature"])
-                columns = [archive[name] for name in COLUMNS]
+            archive = store.read()
+        except InputError as error:
+            raise InputError(f"{error}; {advice}") from None
+        if not archive:
+            return {}
+        try:
+            digest, center_loss = str(archive["digest"]), float(archive["center_loss"])
+            has_pieces = bool(archive["has_signature"])
+            columns = [archive[name] for name in COLUMNS]
             if any((each.dtype.kind, each.ndim) != (kind, 1) for each, kind in zip(columns, COLUMNS.values())):
                 raise ValueError(
                     f"expected one-dimensional {', '.join(COLUMNS)} of kinds {', '.join(COLUMNS.values())}"
                 )
             points, values, crossed = (each.tolist() for each in columns)
             stored = dict(zip(points, zip(values, crossed, strict=True), strict=True))
-        except MemoryError:
-            raise
-        except Exception as error:  # NumPy and zipfile may raise nearly anything of damaged bytes
-            raise InputError(
-                f"expected a slice's evaluations in {self._store}, got a damaged file ({error}); {advice}"
-            ) from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"expected a slice's evaluations in {store}, got others ({error}); {advice}") from None
         if digest != self._digest:
             raise InputError(
                 f"expected evaluations of this slice in {self._store}, got another center, other directions or "

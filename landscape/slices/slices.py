@@ -10,7 +10,6 @@ the curvature instead: the distance r sqrt(2 dL / |lambda|), at which the quadra
 
 from collections.abc import Sequence
 from math import isfinite, sqrt
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -21,7 +20,7 @@ from landscape.errors import InputError
 from landscape.linalg import column_lengths
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.results import Progress
-from landscape.slices.grid_evaluations import GridEvaluations, Loss
+from landscape.slices.grid_evaluations import GridEvaluations, Loss, Store
 from landscape.slices.interpolation import PlaneInterpolant
 from landscape.slices.refinement import Refined, SliceSettings, evaluate_adaptively
 from landscape.slices.slice import Slice
@@ -67,7 +66,7 @@ def evaluate_slice(
     operator: SymmetricOperator | Float64[Tensor, "d d"] | None = None,
     settings: SliceSettings = SliceSettings(),
     generator: torch.Generator | None = None,
-    store: str | Path | None = None,
+    store: Store | None = None,
     progress: Progress | None = None,
 ) -> Slice:
     """loss on the grid coordinates[0] x coordinates[1] (d = 2) or along coordinates[0] (d = 1).
@@ -76,7 +75,7 @@ def evaluate_slice(
     settings.workers threads.  coordinates: increasing, in multiples of the directions.  gradient, operator: both at center, for
     the quadratic model, or neither; the model takes d matvecs, or none if the operator is given as the matrix E^T H E.
     settings: for a plane; every point of a line is evaluated.  generator: draws the hold-out points (`refinement`) of a plane;
-    may be None only if settings.tolerance is.  store: a file that keeps evaluations, from which an interrupted run continues.
+    may be None only if settings.tolerance is.  store: keeps evaluations, from which an interrupted run continues.
     Raises InputError if the objective at the centre is not finite, or store holds another slice.
 
     >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
@@ -90,8 +89,7 @@ def evaluate_slice(
     axes = [axis.detach().double() for axis in coordinates]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
     shape, points = grid.shape[:-1], grid.reshape(-1, len(axes))
-    file = None if store is None else Path(store)
-    found = GridEvaluations(loss, center, directions, points, settings.workers, file, progress)
+    found = GridEvaluations(loss, center, directions, points, settings.workers, store, progress)
     slope = curvature = model = None
     if gradient is not None and operator is not None:
         slope, curvature = _derivatives(gradient, operator, directions)

@@ -17,8 +17,8 @@ scene and a seed make a cell, OUT/cells/SCENE-RULE-SEED.json; those that there a
 OUT/study.csv: a row for each round of each cell; study.png: held-out PSNR by the number of views.
 """
 
-import tomllib
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import pandas as pd
@@ -29,15 +29,16 @@ from rich.console import Console
 
 from analysis.commands.uses.next_view import informations, picked
 from analysis.console.plain import say
-from analysis.records.json_files import json_text
+from analysis.records.json_files import json_text, read_json
+from analysis.records.schema import Count
 from figures.style import literal, new_figure, save, style
 from figures.uses import RULES as LOOKS
 from landscape.errors import InputError
 from splat.curvature.scores.information import GAINS
+from splat.model.untrusted import read_toml, require_name, write_atomically
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import split_scene
 from splat.scenes.view import View
-from splat.training.checkpoint import write_atomically
 from splat.training.loop import train
 from splat.training.score.evaluate import evaluate
 from splat.training.start import initial_gaussians
@@ -67,16 +68,29 @@ class Study(msgspec.Struct, forbid_unknown_fields=True):
 Row = dict[str, str | int | float]
 
 
+class CellRow(msgspec.Struct):
+    """A row of `cell`, and which cell."""
+
+    scene: str
+    rule: str
+    seed: int
+    round: Count
+    views: Count
+    added: str
+    psnr: float
+    ssim: float
+
+
+class Cell(msgspec.Struct):
+    """A file of OUT/cells: told, its settings in words, and its rows, one at least."""
+
+    told: str
+    rows: Annotated[list[CellRow], msgspec.Meta(min_length=1)]
+
+
 def run_study(file: Path) -> int:
     """Run the cells that are missing; returns the exit code."""
-    try:
-        study = msgspec.convert(tomllib.loads(file.read_text(encoding="utf-8")), Study)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
-        raise InputError(f"expected a study of next views in {file}, got: {error}") from None
-    if unknown := [rule for rule in study.rules if rule not in RULES]:
-        raise InputError(f"expected rules among {', '.join(RULES)} in {file}, got {unknown[0]!r}")
-    if min(study.start - 1, study.rounds, study.first_steps, study.steps) < 1 or not (study.seeds and study.scenes):
-        raise InputError(f"expected start of at least 2, rounds, steps and seeds in {file}, got {study}")
+    study = read_study(file)
     out, console, rows = file.parent / study.out, Console(stderr=True), list[Row]()
     (out / "cells").mkdir(parents=True, exist_ok=True)
     cells = [(name, rule, seed) for seed in study.seeds for name in study.scenes for rule in study.rules]
@@ -99,16 +113,31 @@ def run_study(file: Path) -> int:
     return 0
 
 
+def read_study(file: Path) -> Study:
+    """InputError where the file is none."""
+    try:
+        study = msgspec.convert(read_toml(file), Study)
+        for name in study.scenes:
+            require_name(name)
+    except (InputError, msgspec.ValidationError) as error:
+        raise InputError(f"expected a study of next views in {file}, got: {error}") from None
+    if unknown := [rule for rule in study.rules if rule not in RULES]:
+        raise InputError(f"expected rules among {', '.join(RULES)} in {file}, got {unknown[0]!r}")
+    if any(len(set(each)) < max(len(each), 1) for each in (study.seeds, study.rules)):
+        raise InputError(f"expected different seeds and rules, at least one of each, in {file}, got {study}")
+    if min(study.start - 1, study.rounds, study.first_steps, study.steps) < 1 or not (study.seeds and study.scenes):
+        raise InputError(f"expected start of at least 2, rounds, steps and seeds in {file}, got {study}")
+    return study
+
+
 def _kept(path: Path, told: str) -> list[Row] | None:
     """Earlier result of the cell, under the same settings."""
     if not path.is_file():
         return None
-    content = msgspec.json.decode(path.read_bytes())
-    if content["told"] != told:
-        raise InputError(
-            f"expected cells of the study's settings {told}, got {content['told']} in {path}; name another out"
-        )
-    return content["rows"]
+    found = read_json(path, Cell, "a cell of a study", "remove it, and it is measured again")
+    if found.told != told:
+        raise InputError(f"expected cells of the study's settings {told}, got {found.told} in {path}; name another out")
+    return [msgspec.to_builtins(row) for row in found.rows]
 
 
 def cell(scene: Scene, study: Study, rule: str, seed: int) -> list[Row]:

@@ -28,7 +28,7 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
 from landscape.results import Progress
-from splat.backend.memory import free_memory, give_back_freed
+from splat.backend.memory import free_memory
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import KeptViews, LinearizedView
 from splat.losses.reference import LossSettings
@@ -268,9 +268,8 @@ class SceneObjective:
         return KeptViews(self.linearizer(self.active), len(self.views), self._memory)
 
     def release(self) -> None:
-        """Free the linearized views, and return their memory to the system; the next use makes them anew."""
+        """Free the linearized views; the next use makes them anew."""
         vars(self).pop("linearized", None)
-        give_back_freed()
 
     def linearizer(self, gaussians: Gaussians) -> Callable[[int], LinearizedView]:
         """A function that linearizes the view of an index at these Gaussians.

@@ -66,6 +66,8 @@ def typed(kind: Any, content: Any, where: str = "", strict: bool = True) -> Any:
     _require_no_tensor(kind, content, where)
     try:
         return msgspec.convert(content, kind, strict=strict)
+    except UnicodeEncodeError as error:
+        raise InputError(f"{where and repr(where) + ': '}expected text, got {reprlib.repr(error.object)}") from error
     except msgspec.ValidationError as error:
         said, _, path = str(error).replace("`", "").partition(" - at ")
         path = path.rpartition("$")[2]

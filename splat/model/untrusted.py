@@ -1,28 +1,44 @@
-"""Files that anyone may have written, and files that two programs may want to write at a time.
+"""The one reader of files that anyone may have written, and the one writer of files that two programs may want to write.
 
 A file from outside is read only where what it promises fits its size on disk: what it would take in memory is known before any
-of it is read.
+of it is read.  What becomes of it is plain types, arrays or a picture, of the sizes that are there; what these mean is checked
+where they are used.
 """
 
+import errno
 import fcntl
 import glob
+import json
 import os
+import re
+import shutil
+import tomllib
+import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from hashlib import sha256
 from io import BytesIO
 from math import prod
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
+import msgspec
 import numpy as np
 import psutil
+from PIL import Image
 
 from landscape.errors import InputError
 
 EXPANSION = 32  # times its size on disk that an archive may hold; what this program writes is not compressed
 SLACK = 2**20  # bytes that any archive may hold
 FOLDER = 0x10  # among the attributes of a member
+MOST_TEXT = 2**28  # bytes of a file of text
+MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
+NAME = r"^[\w+-][\w.+ -]{0,99}$"  # of a file in a record, or that becomes a folder: letters, digits, - _ + . and blanks
+LONGEST = 200  # bytes of a name to which more may be added
+UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR)  # of a folder to write in
 TAKEN = "expected {what}, got another at work, which holds {path}; wait until it ends, or choose another --out"
 
 
@@ -80,6 +96,95 @@ def read_array(file: BinaryIO) -> np.ndarray:
         raise InputError(f"no array of numbers ({error})") from error
 
 
+@contextmanager
+def _refusing(what: str, path: Path) -> Iterator[None]:
+    """Turn every error but of memory and of the file system into an InputError that names the file.
+
+    Readers raise nearly anything of damaged bytes.
+    """
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        raise InputError(f"expected {what} in {path}, got a damaged file ({error})") from None
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays that `numpy.savez` wrote, by name.  InputError where the file has others, or fewer than it promises."""
+    with _refusing("arrays", path), zipfile.ZipFile(path) as archive:
+        require_modest(archive)
+        members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+        return {member.filename.removesuffix(".npy"): _member(archive, member) for member in members}
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(member) as file:
+        require_held(cast(BinaryIO, file), member.file_size)
+    with archive.open(member) as file:
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def read_text(path: Path) -> str:
+    """InputError where it is longer than MOST_TEXT, or not UTF-8."""
+    with _refusing("text in UTF-8", path):
+        return _bytes(path).decode("utf-8")
+
+
+def _bytes(path: Path) -> bytes:
+    if (size := path.stat().st_size) > MOST_TEXT:
+        raise InputError(f"{size:,} bytes, of at most {MOST_TEXT:,}")
+    return path.read_bytes()
+
+
+def read_json(path: Path) -> Any:
+    """Content of strict JSON as plain types.  InputError where it is none."""
+    with _refusing("JSON", path):
+        return msgspec.json.decode(_bytes(path))
+
+
+def loose_json(content: str | bytes, parse_int: Callable[[str], Any] | None = None) -> Any:
+    """As Python reads JSON, NaN too, which other tools write.  InputError where it is none."""
+    try:
+        return json.loads(content, parse_int=parse_int)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"no JSON ({error})") from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """InputError where it is none."""
+    with _refusing("TOML", path):
+        return tomllib.loads(_bytes(path).decode("utf-8"))
+
+
+def read_picture(path: Path) -> Image.Image:
+    """A PNG or JPEG.  InputError where it is none, or has more than MOST_PIXELS."""
+    with (
+        _refusing("a picture", path),
+        warnings.catch_warnings(action="error"),
+        Image.open(path, formats=("PNG", "JPEG")) as image,
+    ):
+        if image.width * image.height > MOST_PIXELS:
+            raise InputError(f"{image.width} x {image.height} pixels, of at most {MOST_PIXELS:,}")
+        image.load()
+        return image
+
+
+def require_name(name: str) -> str:
+    """The name, which is to be one of a file or a folder.  InputError where it is not fit for that, and might lead out.
+
+    >>> require_name("fern 2.1")
+    'fern 2.1'
+    """
+    if not re.match(NAME, name) or name.endswith("\n"):
+        raise InputError(
+            f"expected a name of at most 100 letters, digits, - _ + . or blanks, as it names a folder, got {name!r}"
+        )
+    return name
+
+
 class Taken(InputError):
     """A file that another process holds."""
 
@@ -104,17 +209,22 @@ def locked(path: Path, what: str) -> Iterator[int]:
     The system lets go of it when the last process that has it ends, however that comes.  A file system without locks holds
     nothing.  what: which is expected to be alone.  Taken where another process holds it.
     """
-    with _unheard_lock(path, what) as file:
+    with _lock(path, what) as file:
         try:
             yield file.fileno()
         finally:
             path.unlink(missing_ok=True)
 
 
-def _unheard_lock(path: Path, what: str) -> IO[str]:
-    """The file of `locked`, held.  While a function of this name runs no signal is raised, which would leave the file."""
+def _lock(path: Path, what: str) -> IO[str]:
+    """The file of `locked`, held."""
     while True:
-        file = path.open("a")
+        try:
+            file = path.open("a", encoding="utf-8")
+        except OSError as error:
+            if error.errno in UNWRITABLE:
+                raise InputError(f"cannot write in {path.parent}: {error.strerror}; choose another --out") from None
+            raise
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -128,33 +238,84 @@ def _unheard_lock(path: Path, what: str) -> IO[str]:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Where to write what becomes `path` when the block ends: a reader or a crash sees what was there before or all of it."""
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")  # another program may write there too
+def replacing(path: Path, *, folder: bool = False) -> Iterator[Path]:
+    """Where to write what becomes `path` when the block ends: a reader or a crash sees what was there before or all of it.
+
+    folder: it is one, given empty.  After a kill at any point it is the old one, the new one, or (between two renames) absent,
+    with the old one in `.NAME.previous` beside it.
+    """
+    partial = path.with_name(f".{short(path.name)}.partial-{os.getpid()}")  # another program may write there too
+    previous = path.with_name(f".{path.name}.previous")
     try:
+        if folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _remove(partial)
+            partial.mkdir()
         yield partial
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
+        for file in partial.rglob("*") if folder else [partial]:
+            if file.is_file():
+                with file.open("rb") as stream:
+                    os.fsync(stream.fileno())
+        if folder and path.exists():
+            _remove(previous)
+            path.rename(previous)
         os.replace(partial, path)
-        _drop_abandoned(path)
     except BaseException as error:
-        partial.unlink(missing_ok=True)
+        _remove(partial)
+        if folder and previous.exists() and not path.exists():
+            previous.rename(path)
         if isinstance(error, OSError) and error.errno and error.filename is None:
             error.filename = str(path)  # a full disk's error has none
         raise
-
-
-def _drop_abandoned(path: Path) -> None:
-    """Remove what killed processes left of the same file."""
-    for partial in path.parent.glob(f".{glob.escape(path.name)}.partial-*"):
-        process = partial.name.rpartition("-")[2]
+    _remove(previous if folder else partial)
+    for abandoned in path.parent.glob(f".{glob.escape(short(path.name))}.partial-*"):  # of killed processes
+        process = abandoned.name.rpartition("-")[2]
         if process.isdigit() and not psutil.pid_exists(int(process)):
-            partial.unlink(missing_ok=True)
+            _remove(abandoned)
+
+
+def short(name: str) -> str:
+    """A name to which more may be added: of one that is too long a digest."""
+    content = os.fsencode(name)
+    return name if len(content) <= LONGEST else sha256(content).hexdigest()[:32]
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write content to path, whole or not at all (`replacing`)."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+@dataclass(frozen=True)
+class KeptArrays:
+    """Arrays in an .npz that a command leaves for the next one."""
+
+    path: Path
+
+    def read(self) -> dict[str, np.ndarray]:
+        """By name; none where there is no file."""
+        return read_arrays(self.path) if self.path.exists() else {}
+
+    def write(self, **arrays: np.ndarray) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        content = BytesIO()
+        np.savez(content, **arrays)  # pyright: ignore[reportArgumentType]
+        write_atomically(self.path, content.getvalue())
+
+    def __str__(self) -> str:
+        return str(self.path)
 
 
 def beside(folder: Path) -> Path:
     """Where the lock of a folder lies, which may not exist yet."""
-    return folder.absolute().with_name(f".{folder.name}.lock")
+    return folder.absolute().with_name(f".{short(folder.name)}.lock")
 
 
 def _is_at(descriptor: int, path: Path) -> bool:

@@ -22,7 +22,6 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.results import Brief
-from splat.backend.memory import give_back_freed
 from splat.model.camera import Camera
 
 Subset = Literal["train", "test"]
@@ -104,7 +103,6 @@ class Shelf:
             self._kept[frame] = found
             while len(self._kept) > 1 and sum(each.bytes for each in self._kept) > self._memory:
                 self._kept.popitem(last=False)
-                give_back_freed()
         return found
 
 

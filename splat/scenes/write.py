@@ -2,9 +2,6 @@
 
 import io
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +15,7 @@ from torch import Tensor
 
 from splat.model.camera import Camera
 from splat.model.files.ply import ply_bytes
+from splat.model.untrusted import replacing
 from splat.scenes.formats.transforms import SINGLE_FILE
 from splat.scenes.scene import Scene
 from splat.scenes.view import Frame, Points
@@ -43,14 +41,8 @@ def finished_folder(folder: Path) -> Iterator[Path]:
     """A new folder that becomes `folder` when the block ends, and is removed if it fails.  FileExistsError if there is one."""
     if folder.exists():
         raise FileExistsError(f"expected a folder that does not exist yet, got {folder}; remove it or choose another")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
+    with replacing(folder, folder=True) as building:
         yield building
-        building.chmod(0o755)  # temporary folders are private
-        os.replace(building, folder)
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
 
 
 def write_transforms_scene(scene: Scene, folder: Path) -> None:

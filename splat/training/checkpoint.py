@@ -26,7 +26,7 @@ from splat.losses.reference import LossSettings
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.typed import MOST, Count, leaves, typed
-from splat.model.untrusted import replacing, require_whole
+from splat.model.untrusted import loose_json, require_whole, write_atomically
 from splat.scenes.scene import Scene
 from splat.scenes.splits import spread_views
 from splat.training.adam import Adam
@@ -94,7 +94,7 @@ class Checkpoint(Brief):
         trained = asdict(config) | {"extent": f"{self.training.extent:.9g}"}
         question = leaves({"objective": objective, "training": trained, "settings": dict(settings), "seed": seed})
         data = {name: scene.views[name] for name in scene.train} | dict(further or {})
-        return Fingerprint(data, json.loads(json.dumps(question, default=str)), self.state)  # as it is read again
+        return Fingerprint(data, loose_json(json.dumps(question, default=str)), self.state)  # as it is read again
 
     def thinned(self, scene: Scene, count: int | None) -> "Checkpoint":
         """The same with at most `count` of its training views, spread evenly over their cameras; None: all."""
@@ -221,12 +221,6 @@ def _interned(content: Any) -> Any:
     return sys.intern(content) if type(content) is str else content
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write content to path, whole or not at all (`replacing`)."""
-    with replacing(path) as partial:
-        partial.write_bytes(content)
-
-
 def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:
     """The checkpoint of `load_checkpoint`, or another tool's file as one; ask, picture: see `foreign_training`.
 
@@ -292,6 +286,9 @@ def _read(file: BinaryIO, path: Path) -> Any:
         bad_seek = isinstance(error, OSError) and error.errno == errno.EINVAL  # caused by a damaged index
         if lacks_memory(error) or (isinstance(error, OSError) and not bad_seek):
             raise
+        runs = [folder for folder in path.absolute().parents[:2] if (folder / "checkpoint.pt").is_file()]
+        if runs and path.name != "checkpoint.pt" and not zipfile.is_zipfile(path):
+            raise InputError(f"{KIND}, got {path}, another file of the run {runs[0]}; name that run") from error
         ply = " (of other tools' files, probe, slice and convert read those)" if path.suffix.lower() == ".ply" else ""
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise InputError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {reason}; {REMEDY}") from error

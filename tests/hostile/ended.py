@@ -103,7 +103,7 @@ class Ended:
         time.sleep(chance.random() * (self.seconds + 3 * apart))
         process.send(number)
         code = process.wait()
-        allowed = {-9, 0} if number == signal.SIGKILL else {128 + number, 0} | ({-number} if apart else set())
+        allowed = {-number, 0} if number == signal.SIGKILL else {-number, 128 + number, 0}
         assert code in allowed, f"exit code {code}"
         aside = self.out.with_name(f".{self.out.name}.previous")
         assert not before or self.out.exists() or (number == signal.SIGKILL and aside.exists()), (

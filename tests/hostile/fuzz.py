@@ -22,6 +22,7 @@ import warnings
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.util import find_spec
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
 from multiprocessing.forkserver import ensure_running
@@ -168,6 +169,10 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    if find_spec("pytest") is None:
+        parser.error(
+            "expected the developers' tools, found no pytest; pip install -e '.[dev]', or make test, brings them"
+        )
     from tests.hostile.formats import FORMATS
 
     bad = 0

@@ -2,7 +2,7 @@
 
 Each round begins a command in a process of its own and ends it.  What lies there then must be whole: nothing, what was there
 before, or what a command writes.  The same command is then run to its end, and its numbers must be the bits of one that nobody
-ended.  After signals the exit code is 128 + the number, or 0 where the command had come to its end.  A process is a fork of
+ended.  A signal ends a command that listens with 128 + its number, or 0 where it had come to its end.  A process is a fork of
 this one, in which everything is imported but nothing has been run, and which draws no pictures; every fifth is a program of
 its own, which does.
 """

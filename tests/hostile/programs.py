@@ -21,12 +21,12 @@ for _name in (*LATE, *(each.runs.split(":")[0] for each in cli.COMMANDS.values()
 
 
 @contextmanager
-def nothing_begun(_: list[str]) -> Iterator[None]:
+def nothing_begun(*_: object) -> Iterator[None]:
     yield
 
 
 class forked:
-    """A fork that runs a function, quietly and without pictures, and ends with what it returns.  Its signals raise by then."""
+    """A fork that runs a function, quietly and without pictures, and ends with what it returns."""
 
     def __init__(self, run: Callable[[], int], said: Path = Path(os.devnull)) -> None:
         """said: the file for what it prints."""

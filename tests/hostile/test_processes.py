@@ -1,6 +1,7 @@
 """Commands as processes: signals, full disks, folders that cannot be written, no home, two at work on one folder."""
 
 import os
+import re
 import resource
 import shlex
 import signal
@@ -12,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from analysis.commands.cli import main
-from analysis.console.interruption import raising
 from landscape.errors import InputError
 from splat.model.untrusted import beside, locked
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -93,28 +93,6 @@ def test_a_probe_that_a_signal_ends_as_it_begins_leaves_nothing(run, tmp_path):
     assert "Aborted at" not in said and list(tmp_path.iterdir()) == []
 
 
-def test_a_signal_raises_while_pycolmap_is_imported(tmp_path):
-    program = (
-        "import os, signal\nfrom analysis.console.interruption import Interrupted, raising\n"
-        "with raising():\n    import splat.scenes.scene\n    try:\n        os.kill(os.getpid(), signal.SIGTERM)\n"
-        "    except Interrupted as error:\n        print(error.exit_code)"
-    )
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("143\n", "")
-
-
-def test_a_signal_while_pycolmap_loads_is_heard_once_it_has(tmp_path):
-    program = (
-        "import os, signal, sys\nfrom analysis.console.interruption import Interrupted, raising\n"
-        "class Signals:\n    def find_spec(self, name, *_):\n        if name == 'pycolmap._core':\n"
-        "            os.kill(os.getpid(), signal.SIGHUP)\nsys.meta_path.insert(0, Signals())\n"
-        "try:\n    with raising():\n        import splat.scenes\nexcept Interrupted as error:\n"
-        "    print(error.exit_code, 'pycolmap' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("129 True\n", "")
-
-
 def test_pictures_are_written_whichever_library_was_imported_first():
     program = (
         "import splat.scenes, io, zlib\nfrom PIL import Image\nfile = io.BytesIO()\n"
@@ -123,15 +101,6 @@ def test_pictures_are_written_whichever_library_was_imported_first():
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert (done.stdout, done.stderr) == ("(50, 50) 1000000\n", "")
-
-
-def test_signals_that_are_ignored_stay_so():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup leaves it
-    try:
-        with raising():
-            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_second_command_on_a_folder_is_refused_and_a_killed_one_holds_nothing(tmp_path):
@@ -171,7 +140,8 @@ def test_a_folder_that_is_taken_or_cannot_be_written_is_known_at_once(run, tmp_p
         assert main([*command, str(tmp_path / "record")]) == 2
     assert main([*command, "/proc/self/record"]) == 2  # where not even root may write
     said = capsys.readouterr().err
-    assert "got another at work" in said and "/.record.lock: No such file" in said and "linearise" not in said
+    assert "got another at work" in said and "linearise" not in said
+    assert re.search(r"cannot write in /proc/\d+: No such file or directory; choose another --out", said), said
     assert main([word, str(tmp_path / "none/checkpoint.pt")]) == 2 and list(tmp_path.iterdir()) == []
 
 
@@ -189,13 +159,6 @@ def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_pa
     said = done.communicate(timeout=PATIENCE)[1]
     assert done.returncode == 74 and str(tmp_path / ".probe.unfinished/") in said and "Traceback" not in said, said
     assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]  # from where it goes on
-
-
-def test_a_command_with_too_few_addresses_says_so_before_it_begins(tmp_path):
-    few = 2**30
-    done = started(["probe", str(tmp_path)], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (few, few)))
-    said = done.communicate(timeout=PATIENCE)[1]
-    assert done.returncode == 71 and said.startswith("landscape: expected at least 2,147 MB of addresses"), said
 
 
 def test_without_a_home_or_a_folder_beside_the_code_kernels_are_kept_with_temporary_files(tmp_path, monkeypatch):

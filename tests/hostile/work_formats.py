@@ -1,6 +1,7 @@
 """What commands leave for commands to come: slices, the table of a study, and what an interrupted one goes on from."""
 
 import io
+import json
 from typing import ClassVar
 
 import numpy as np
@@ -74,6 +75,92 @@ class StudyCsv(Format):
             captions(rows, ["predictors", "budget", "axes"])
 
 
+class MapFiles(Format):
+    """A map beside a probe, whose page does without it where it is damaged."""
+
+    name = "map.json, map/*.npz, *.png"
+    refuses = False
+
+    def write(self) -> None:
+        from analysis.records.json_files import plain
+        from splat.training.origin.fingerprint import Fingerprint
+        from tests.analysis.records.test_report import with_views
+        from tests.recorded import synthetic, written_map
+
+        data, _ = synthetic()
+        data["provenance"]["fingerprint"] = plain(Fingerprint({}, {}, "00"))
+        written_map(self.root / "map", data["provenance"])
+        with_views(self.root / "probe", ["a.png"], data)
+
+    def broken(self) -> list[str]:
+        return [f"map/{path.name}" for path in sorted((self.root / "map").iterdir())]
+
+    def mutated(self, chance: Random, name: str, content: bytes) -> bytes:
+        of_array = name.endswith("npz") and chance.random() < 0.6
+        return of_arrays(chance, content) if of_array else super().mutated(chance, name, content)
+
+    def use(self) -> None:
+        from analysis.records.records import read_record
+        from analysis.records.report import render_report
+
+        text = render_report(read_record(self.root / "probe"))
+        assert text.rstrip().endswith("</html>") and "photograph" in text, "a page without its own pictures"
+
+
+class StudyToml(Format):
+    """A study of next views, and a cell of it."""
+
+    name = "study.toml, cells/*.json"
+
+    def write(self) -> None:
+        (self.root / "study.toml").write_text(
+            'out = "out"\nrules = ["d"]\nseeds = [0]\n[scenes."fern 2"]\npath = "fern"\n'
+        )
+        row = {"scene": "fern", "rule": "d", "seed": 0, "round": 0, "views": 2, "added": "", "psnr": 9.0, "ssim": 0.5}
+        (self.root / "cell.json").write_text(json.dumps({"told": "this", "rows": [row]}))
+
+    def broken(self) -> list[str]:
+        return ["study.toml", "cell.json"]
+
+    def use(self) -> None:
+        from notebooks.uses.study import _kept, read_study
+
+        study = read_study(self.root / "study.toml")
+        assert all((self.root / name).parent == self.root for name in study.scenes), "a name that leads out"
+        _kept(self.root / "cell.json", "this")
+
+
+class OriginOfRecord(Format):
+    """The provenance of a probe of another tool's file, which compare opens as it was probed."""
+
+    name = "origin of probe.json"
+
+    def write(self) -> None:
+        from tests.recorded import synthetic, written
+
+        data, arrays = synthetic()
+        preset = {"render": {"antialias": "none"}, "loss": {"opacity_reg": 0.0, "scale_reg": 0.01}}
+        origin = {"trained_by": "gsplat", "images": None, "downscale": 2.0, "preset": preset, "notes": ["assumed"]}
+        data["provenance"] |= {"origin": origin, "scene_folder": "fern", "views": ["a.png"]}
+        written(self.root / "probe", data, arrays)
+
+    def broken(self) -> list[str]:
+        return ["probe/probe.json"]
+
+    def mutated(self, chance: Random, name: str, content: bytes) -> bytes:
+        data = json.loads(content)
+        data["provenance"]["origin"] = mutations.of_tree(chance, data["provenance"]["origin"])
+        return json.dumps(data).encode("utf-8", "surrogatepass")
+
+    def use(self) -> None:
+        from analysis.records.records import ProbeRecord, read_record
+        from analysis.runs.compared import _as_probed
+
+        made = read_record(self.root / "probe", ProbeRecord).data.provenance
+        if made.origin and made.scene_folder:
+            _as_probed(made)
+
+
 class KeptStages(Format):
     """Stages of an interrupted probe: what is damaged is measured again."""
 
@@ -127,11 +214,12 @@ class KeptPoints(Format):
 
     def use(self) -> None:
         from landscape.slices.grid_evaluations import GridEvaluations
+        from splat.model.untrusted import KeptArrays
 
         points = torch.cartesian_prod(*[torch.linspace(-1, 1, 5, dtype=torch.float64)] * 2)
         center, directions = torch.ones(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)[:, :2]
         store = self.root / "points.npz"
-        found = GridEvaluations(lambda theta: (theta**2).sum(), center, directions, points, store=store)
+        found = GridEvaluations(lambda theta: (theta**2).sum(), center, directions, points, store=KeptArrays(store))
         found.require(range(len(points)))
         true = ((center + points @ directions.T) ** 2).sum(dim=1).numpy()
         assert found.known.all() and found.value.dtype == true.dtype, "points without a value"

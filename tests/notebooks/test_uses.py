@@ -74,3 +74,25 @@ def test_a_study_that_cannot_be_is_refused(folder, line, words):
     (folder / "wrong.toml").write_text("\n".join([line, *kept]))
     with pytest.raises(InputError, match=words):
         main([str(folder / "wrong.toml")])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        'seeds = [0, 0]', 'rules = ["d", "d"]', "rules = []", "seeds = []", '[scenes."../esc"]\npath = "x"',
+        '[scenes."/abs"]\npath = "x"', '[scenes."a\\u0000"]\npath = "x"', "rounds = " + "9" * 6000, "a = " + "[" * 5000,
+    ],
+)  # fmt: skip
+def test_a_study_that_repeats_itself_or_leads_out_is_refused_before_it_begins(tmp_path, change):
+    file = tmp_path / "study.toml"
+    file.write_text(f'out = "out"\n{change}\n[scenes.fern]\npath = "fern"\n')
+    with pytest.raises(InputError, match=r"study\.toml"):
+        study.run_study(file)
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]", '{"told": "this", "rows": []}', '{"told": "this", "rows": [{}]}'])
+def test_a_damaged_cell_is_refused_with_the_remedy(tmp_path, content):
+    (tmp_path / "cell.json").write_text(content)
+    with pytest.raises(InputError, match="remove it, and it is measured again"):
+        study._kept(tmp_path / "cell.json", "this")

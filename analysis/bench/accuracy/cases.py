@@ -34,7 +34,7 @@ from landscape.traces.trace import TraceSettings, total_trace
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
-from splat.training.checkpoint import write_atomically
+from splat.model.untrusted import read_json, write_atomically
 
 SAMPLES, FINE, MOST = 128, 1e-6, 250  # MOST: products of the search for the ends
 STARTS, STEPS = 6, 24
@@ -127,7 +127,7 @@ def checkpoint_case(path: Path, out: Path, downscale: float = 1.0) -> Case:
     hessian = SceneHessian(objective)
     key = {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "downscale": downscale, "dim": hessian.dim}
     stored = out / TRUTH
-    kept = json.loads(stored.read_text()) if stored.is_file() else {}
+    kept = read_json(stored) if stored.is_file() else {}
     if kept.get("of") != key:
         kept = {"of": key, "truth": asdict(_truth(objective, hessian))}
         write_atomically(stored, json.dumps(kept, indent=1).encode())

@@ -23,8 +23,6 @@ goes before one of a scene, and that before one of the top.  A cell is one run o
 all of the first seed come before those of the second, so that a sweep that is stopped has compared like with like.
 """
 
-import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
@@ -35,10 +33,10 @@ from analysis.console.overrides import leaves, read_value
 from analysis.probe.options import ProbeOptions
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError
+from splat.model.untrusted import read_toml, require_name
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
 
-FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
 OF_THE_CELL = {"checkpoint", "out", "scene", "foreign"}  # options of probe that the cell decides
 TRAINER = get_type_hints(TrainerOptions)
@@ -101,11 +99,7 @@ def read_sweep(file: Path, out: Path | None = None, probe: bool = False) -> Swee
             f"expected a sweep in TOML at {file}, found no such file; landscape sweep --help has an example"
         )
     try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"expected a sweep in TOML in {file}, got a file that is none: {error}") from None
-    try:
-        return _sweep(content, file, out, probe)
+        return _sweep(read_toml(file), file, out, probe)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
 
@@ -160,10 +154,7 @@ def _tables(found: Any, name: str) -> dict[str, dict[str, Any]]:
     for key, table in found.items():
         if not isinstance(table, dict):
             raise InputError(f"expected a table [{name}.{key}], got {key} = {table!r}")
-        if not FOLDER_NAME.fullmatch(key):
-            raise InputError(
-                f"expected a name of letters, digits, - _ + . or blanks, as it names a folder, got {key!r}"
-            )
+        require_name(key)
     return found
 
 

@@ -8,6 +8,7 @@ to anything else (training, scenes) compiles nothing anew.  Folders of earlier c
 
 import os
 import re
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from tempfile import gettempdir
@@ -44,22 +45,30 @@ def _places() -> list[Path]:
         return [Path(chosen)]
     home = Path(os.path.expanduser("~"))  # remains as it is where there is none
     caches = [home / ".cache" / "splat-landscape"] if home.is_dir() else []
-    return [PACKAGE / "__pycache__", *caches, Path(gettempdir()) / f"splat-landscape-{os.getuid()}"]
+    with suppress(OSError):  # no folder for temporary files can be written
+        caches.append(Path(gettempdir()) / f"splat-landscape-{os.getuid()}")
+    return [PACKAGE / "__pycache__", *caches]
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether a folder can be written, made if it must be, and belongs to this user: what lies in it is run."""
+    """Whether a folder can be written, made if it must be, by this user alone: what lies in it is run."""
     try:
         folder.mkdir(mode=0o755, parents=True, exist_ok=True)
-        owners = {folder.stat().st_uid, folder.parent.stat().st_uid}
+        found = [folder.stat(), folder.parent.stat()]
     except OSError:
         return False
-    return os.access(folder, os.W_OK) and owners <= {os.getuid(), 0}
+    return os.access(folder, os.W_OK) and all(map(_is_this_users, found))
+
+
+def _is_this_users(found: os.stat_result) -> bool:
+    """Whether nobody else may write there: not all, nor a group but the user's own."""
+    shared = found.st_mode & 0o002 or (found.st_mode & 0o020 and found.st_gid != os.getgid())
+    return found.st_uid in (os.getuid(), 0) and not shared
 
 
 def _sources() -> list[Path]:
     """The files that a kernel's code may come from."""
-    texts = {path: path.read_text() for path in PACKAGE.rglob("*.py")}
+    texts = {path: path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
     pending = [path for path, text in texts.items() if KERNEL.search(text)]
     found = set(pending)
     while pending:

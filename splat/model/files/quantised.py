@@ -11,7 +11,6 @@ The curvature at such Gaussians is that of the rounded scene, not of the trained
 """
 
 import io
-import json
 import struct
 import tempfile
 import warnings
@@ -30,6 +29,7 @@ from splat.model.files.ply import Header, read_header, read_rows
 from splat.model.files.splat_file import SplatFile, clamped_note, logit, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00, harmonics
+from splat.model.untrusted import loose_json
 
 SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 CHUNK = 256  # Gaussians of a compressed PLY's chunk
@@ -150,7 +150,7 @@ def read_sog(content: bytes) -> SplatFile:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             if sum(info.file_size for info in archive.infolist()) > 4 * len(content) + (1 << 20):
                 raise InputError("its members are far larger than the file")
-            meta = json.loads(archive.read("meta.json"))
+            meta = loose_json(archive.read("meta.json"))
             _check_sog(meta, {name: archive.read(name) for name in archive.namelist() if name.endswith(".webp")})
     except InputError:
         raise

@@ -16,7 +16,6 @@ files, because the sparse-view protocols count them.  Frames of a single file ar
 which captures often list, are skipped.
 """
 
-import json
 from collections.abc import Mapping
 from math import isfinite, pi, tan
 from pathlib import Path
@@ -29,7 +28,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from splat.model.files.ply import read_header, read_rows
-from splat.model.untrusted import inside
+from splat.model.untrusted import inside, loose_json
 from splat.scenes.images import (
     PINHOLE_MODELS,
     RADIAL_MODELS,
@@ -79,7 +78,7 @@ def read_transforms(
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"), parse_int=float)  # of which the largest is infinite
+        data = loose_json(path.read_text(encoding="utf-8"), parse_int=float)  # of which the largest is infinite
     except (ValueError, OSError, RecursionError) as error:
         raise InputError(f"expected a JSON file with frames, cannot read {path}: {error}") from error
     frames = data.get("frames") if isinstance(data, dict) else None

@@ -150,7 +150,7 @@ def _match(database: Path, names: Sequence[str], pairs: Path, on_progress: Progr
     options.match_list_path = pairs
     on_progress("matches", 1, len(names))
     for i, name in enumerate(names[1:], start=1):
-        pairs.write_text("".join(f"{earlier} {name}\n" for earlier in names[:i]))
+        pairs.write_text("".join(f"{earlier} {name}\n" for earlier in names[:i]), encoding="utf-8")
         pycolmap.match_image_pairs(
             database, matching_options=matching(), pairing_options=options, verification_options=verification()
         )

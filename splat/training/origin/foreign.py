@@ -5,7 +5,6 @@ its convention holds.  Before anything is measured the Gaussians are rendered on
 picture, frame, images or conventions are wrong, and so would be all numbers.
 """
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -23,6 +22,7 @@ from splat.model.files.read import model_folder, read_splats
 from splat.model.files.splat_file import SplatFile
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
+from splat.model.untrusted import loose_json
 from splat.render.render import render
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, explicit_split, split_scene
@@ -162,7 +162,7 @@ def _used(path: Path, scene: Scene) -> set[str]:
     if not file.is_file():
         return set()
     try:
-        listed = {Path(str(camera["img_name"])).stem for camera in json.loads(file.read_text(encoding="utf-8"))}
+        listed = {Path(str(camera["img_name"])).stem for camera in loose_json(file.read_text(encoding="utf-8"))}
     except (ValueError, OSError, KeyError, TypeError, RecursionError):
         return set()
     return {name for name in scene.names if Path(name).stem in listed}

@@ -15,7 +15,6 @@ nerfstudio   `dataparser_transforms.json`: x' = scale (transform x), from the wo
              transforms.json
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,6 +27,7 @@ from jaxtyping import Float
 
 from landscape.errors import InputError
 from splat.model.camera import Camera
+from splat.model.untrusted import loose_json
 from splat.scenes.formats.transforms import SINGLE_FILE
 from splat.scenes.scene import Scene
 from splat.scenes.view import Frame, View
@@ -129,7 +129,7 @@ def nerfstudio_frame(checkpoint: Path, scene: Scene) -> Similarity:
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = loose_json(path.read_text(encoding="utf-8"))
     except (ValueError, OSError, RecursionError) as error:
         raise InputError(f"expected a JSON file, cannot read {path}: {error}") from error
     return content if isinstance(content, dict) else {}

@@ -67,7 +67,7 @@ def test_a_ply_is_probed_and_its_record_says_what_was_assumed(folder):
     quick = ["--quick", "--seconds", "inf", "--slice-points", "5"]
     assert main(["probe", *common, *quick, "--out", str(folder / "probe")]) == 0
     record = read_record(folder / "probe").data
-    assert record.provenance.origin["trained_by"] == "splat-landscape" and len(record.provenance.views) == 2
+    assert record.provenance.origin.trained_by == "splat-landscape" and len(record.provenance.views) == 2
     assert any("trained by splat-landscape (the file)" in note for note in record.notes)
     assert (record.counts.views, record.counts.views_of) == (2, 4)
     ends, traces = record.eigenvalues, record.traces.values()

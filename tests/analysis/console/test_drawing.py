@@ -45,13 +45,6 @@ def test_drawing_says_the_same_now_and_later(figures):
     assert draw("fails", figures) == later == ["drawing failed: no ink"]
 
 
-@pytest.mark.skipif(not Path("/proc/self/oom_score_adj").exists(), reason="Linux alone has an order of ends")
-def test_where_memory_runs_out_drawing_ends_before_measuring(figures):
-    (figures / "order.py").write_text("input()\nraise SystemExit(open('/proc/self/oom_score_adj').read())")
-    with drawing("order") as drawn:
-        assert int(drawn(figures)[0].split()[-1]) > int(Path("/proc/self/oom_score_adj").read_text())
-
-
 def test_a_drawing_that_the_system_ends_says_why(figures):
     (figures / "ended.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)")
     assert draw("ended", figures) == ["drawing failed: ended by SIGKILL, as Linux does where memory runs out"]

@@ -5,8 +5,14 @@ import errno
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
 
 from analysis.commands import cli
+from analysis.console.failures import report
+from analysis.console.plain import say
 from landscape.errors import InputError
 from splat.training.checkpoint import load_checkpoint
 
@@ -71,3 +77,31 @@ def test_what_the_machine_lacks_is_not_called_damage_to_a_file(monkeypatch, tmp_
     with pytest.raises(type(error)) as caught:
         load_checkpoint(tmp_path / "checkpoint.pt")
     assert caught.value is error
+
+
+@pytest.mark.parametrize("evil", ["\x1b[2J", "\x1b]0;x\x07", "\x9b2J", "\x08\x7f"])
+def test_what_a_terminal_obeys_is_never_printed(capsys, evil):
+    console, table = Console(), Table("view")
+    table.add_row(escape(f"a{evil}.png"))
+    console.print(table, f"a{evil}.png", Text(f"a{evil}.png"))
+    say(f"a{evil}.png")
+    for error in (InputError(f"got a{evil}.png"), FileNotFoundError(2, "No such file", f"a{evil}.png")):
+        report(error, [])
+    said = "".join(capsys.readouterr())
+    assert said.count(".png") == 6 and not any(each in said for each in "\x1b\x07\x08\x7f\x9b")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("NUMBA_NUM_THREADS", "0"), ("NUMBA_NUM_THREADS", "-1"), ("NUMBA_DISABLE_JIT", "1")]
+)
+def test_settings_with_which_nothing_compiles_are_refused_in_a_sentence(monkeypatch, capsys, name, value):
+    monkeypatch.setenv(name, value)
+    assert cli.main(["probe", "nowhere"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert name in line and value in line and line.endswith("; unset it")
+
+
+def test_settings_of_numba_in_the_current_folder_are_refused(monkeypatch, capsys, tmp_path):
+    (tmp_path / ".numba_config.yaml").write_text("cache_dir: theirs")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["probe", "nowhere"]) == 2 and ".numba_config.yaml" in capsys.readouterr().err

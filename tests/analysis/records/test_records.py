@@ -17,6 +17,7 @@ from analysis.records.json_files import plain
 from analysis.records.records import ProbeRecord, SliceRecord, read_record, record_folder, write_data
 from analysis.records.run_files import read_trajectory
 from analysis.records.tables import family_table, probe_table
+from landscape.errors import InputError
 from tests import recorded
 from tests.figures.test_trajectory_figure import rows
 from tests.recorded import probe_of, synthetic
@@ -55,12 +56,13 @@ def test_a_record_comes_back_as_it_was_written(tmp_path):
 def test_a_number_of_any_size_survives_exactly(tmp_path, number):
     data, arrays = synthetic()
     record = recorded.written(tmp_path / "probe", data, arrays)
-    record.data.traces["means"].value = np.float64(number)
-    record.data.counts.gaussians = np.int64(7)
+    trace = record.data.traces["means"]
+    trace.value, trace.low, trace.high = np.float64(number), None, None
+    record.data.counts.products = np.int64(7)
     write_data(record.folder, record.data)
     record = read_record(record.folder, ProbeRecord)
     assert record.data.traces["means"].value == number
-    assert record.data.counts.gaussians == 7
+    assert record.data.counts.products == 7
 
 
 def test_data_are_written_anew_beside_the_arrays_that_are_there(tmp_path):
@@ -388,3 +390,31 @@ def test_damaged_trajectories_are_refused_by_file_and_column(tmp_path):
         change(rows()).to_csv(path, index=False)
         with pytest.raises(ValueError, match=words):
             read_trajectory(path)
+
+
+CONTRADICTIONS = {
+    "ends in the wrong order": lambda data: data["eigenvalues"]["max"].update(value=-500.0),
+    "a share above one": lambda data: data["anisotropy"]["share"].update(value=7.0, low=None, high=None),
+    "a rank below 0": lambda data: data["anisotropy"].update(
+        effective_rank={"value": -3.0, "low": None, "high": None, "note": ""}
+    ),
+    "an index above its bracket": lambda data: data["anisotropy"]["saddle"].update(value=9.0, low=1.0, high=2.0),
+    "an index below half a bracket": lambda data: data["anisotropy"]["saddle"].update(value=9.0, low=10.0, high=None),
+    "an interval the wrong way": lambda data: data["traces"]["means"].update(low=1e6, high=1.0),
+    "more in sight than there are": lambda data: data["counts"].update(visible_gaussians=10**9),
+    "more views than all": lambda data: data["counts"].update(views_of=1, views=3),
+    "a loss below 0": lambda data: data["objective"].update(value=-1.0),
+    "a gradient's length below 0": lambda data: data["objective"].update(gradient_norm=-1.0),
+    "more crossings than points": lambda data: data["slice"].update(crossed_points=10**9),
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_a_record_that_contradicts_itself_is_refused(tmp_path, name):
+    data, arrays = synthetic()
+    path = written(tmp_path / "probe", data, arrays) / "probe.json"
+    content = json.loads(path.read_text())
+    CONTRADICTIONS[name](content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"expected `?\w+`? (of at most|of at least)"):
+        read_record(path.parent)

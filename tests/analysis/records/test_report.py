@@ -1,6 +1,8 @@
 import json
 import math
 import re
+import zipfile
+from collections.abc import Callable
 from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
@@ -21,7 +23,7 @@ from analysis.records.report import interactive_surface, numbers, write_report
 from analysis.records.tables import family_table, probe_table
 from figures.eye import eye_over
 from splat.training.origin.fingerprint import Fingerprint, ViewData
-from tests.recorded import depth_section, probe_of, soft, synthetic, written
+from tests.recorded import depth_section, probe_of, soft, synthetic, written, written_map
 
 LEVEL = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 LENS, SIZE = (9.0, 9.0, 4.0, 3.0), (8, 6)
@@ -115,39 +117,7 @@ def test_the_map_beside_the_record_says_where_if_it_is_of_the_same(tmp_path, oth
     of = plain(Fingerprint(seen, {"objective.loss.ssim_weight": 0.2, "settings.field": "largest"}, "00"))
     data["provenance"]["fingerprint"] = of | {"question": {"objective.loss.ssim_weight": 0.2, "seed": 3}}
     made = data["provenance"] | {"fingerprint": of | other}
-    shade = {"name": "largest", "words": "largest <curvature>", "unit": "1", "scale": "log", "low": 0.0, "high": 1.0}
-    swaps = {"lengths": [1.0], "share": [[0.5]], "pairs": [4], "jump": None, "jump_error": None, "sampled": 0}
-    axes = {"condition": {"50": 2.0}, "needles": 0.1, "needles_steepest": {}, "needles_trace": {}, "one_view": 0.2}
-    axes |= {"swaps": swaps, "one_view_trace": None, "opacity_one_view": None}
-    found = {"gaussians": 5, "seen": 4, "field": "largest", "shades": {"largest": shade}, "fragility": axes}
-    found |= {"panels": [{"name": "a.png", "place": 0, "file": "view-000", "psnr": 20.0}], "provenance": made}
-    found["shades"]["error"] = shade | {"name": "error", "words": "error"}
-    carrier = {
-        "gaussian": 3778,
-        "share": 0.8,
-        "attributes": {"quats": 0.8},
-        "sigmas": [0.4, 0.02, 0.01],
-        "aspect": 41.0,
-    }
-    carrier |= {"opacity": 0.7, "views": 1, "one_view": 1.0, "outline": [4.0, 3.0, 2.0, 1.0, 0.0]}
-    end = {"name": "e₁", "curvature": 3.0, "participation": 1.5, "carriers": [carrier], "view": "a.png", "step": 0.1}
-    end |= {
-        "crop": [0, 0, 4, 3],
-        "losses": [1.1, 1.0, 1.2],
-        "factors": [1.9, 0.5],
-        "difference": shade,
-        "file": "steepest-e1",
-    }
-    found["steepest"] = [end | {"sentence": "80% of e₁ turns Gaussian 3,778.", "rendered": "Not confirmed by renders."}]
-    found["steepest"].append(found["steepest"][0] | {"name": "e_min", "curvature": -1.0, "factors": [-0.2, -1.9]})
-    found["steepest"][1] |= {"sentence": "97% of e_min.", "rendered": "", "file": "steepest-e_min"}
-    found["sentences"] = ["80% of e₁ turns Gaussian 3,778.", "97% of e_min.", "Position: half of all pairs."]
-    (tmp_path / "map").mkdir()
-    (tmp_path / "map" / "map.json").write_text(json.dumps(found))
-    largest, error = np.full((6, 8), 254, np.uint8), np.zeros((6, 8), np.uint8)
-    np.savez(tmp_path / "map" / "view-000.npz", largest=largest, error=error)
-    for name in ("steepest-e1.png", "fragility-000.png"):
-        Image.new("RGB", (8, 6)).save(tmp_path / "map" / name)
+    written_map(tmp_path / "map", made)
     text = with_views(tmp_path / "probe", ["a.png"], data).read_text(encoding="utf-8")
     here = not other
     assert text.count("data:image/") == (4 + 2 if here else 2)
@@ -162,6 +132,55 @@ def test_the_map_beside_the_record_says_where_if_it_is_of_the_same(tmp_path, oth
     assert (said.count("80% of e₁ turns Gaussian 3,778.") == 1) == here == ("Position: half" in said)
     (headline,) = re.findall(r'<ul class="headline">(.*?)</ul>', text, re.DOTALL)
     assert ("80% of e₁" in headline.split("<li")[-1]) == here  # the third sentence is the map's
+
+
+def _without_error(folder: Path) -> None:
+    np.savez(folder / "view-000.npz", largest=np.zeros((6, 8), np.uint8))
+
+
+def _bomb(folder: Path) -> None:
+    content = np.lib.format.magic(1, 0)  # whose header would promise what deflates to nothing
+    with zipfile.ZipFile(folder / "view-000.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("largest", "error"):
+            archive.writestr(f"{name}.npy", content + bytes(2**26))
+
+
+def _changed(**end: object) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        data = json.loads((folder / "map.json").read_text())
+        data["steepest"][0] |= end
+        (folder / "map.json").write_text(json.dumps(data))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        _without_error,
+        _bomb,
+        lambda folder: np.savez(folder / "view-000.npz", largest=np.zeros((6, 8)), error=np.zeros((6, 8), np.uint8)),
+        lambda folder: np.savez(
+            folder / "view-000.npz", largest=np.zeros((6, 9), np.uint8), error=np.zeros((6, 8), np.uint8)
+        ),
+        lambda folder: (folder / "steepest-e1.png").write_bytes(b"no picture"),
+        lambda folder: (folder / "map.json").write_text("{"),
+        _changed(file="../../secret"),
+        _changed(file="/etc/passwd"),
+        _changed(losses=[1.0]),
+        _changed(carriers=[]),
+    ],
+)
+def test_a_damaged_map_costs_the_page_its_pictures_alone_and_is_said(tmp_path, damage):
+    data, _ = synthetic()
+    data["provenance"]["fingerprint"] = plain(Fingerprint({}, {}, "00"))
+    whole = with_views(tmp_path / "whole", ["a.png"], data).read_text(encoding="utf-8")
+    written_map(tmp_path / "map", data["provenance"])
+    Image.new("RGB", (8, 6)).save(tmp_path / "secret.png")
+    damage(tmp_path / "map")
+    text = with_views(tmp_path / "probe", ["a.png"], data).read_text(encoding="utf-8")
+    assert text.count("data:image/") == whole.count("data:image/") == 2
+    assert "The map is left out: expected" in Page(text).text
 
 
 def test_photograph_and_render_of_the_training_views_come_first(tmp_path):
@@ -447,7 +466,7 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     tmp_path, index, settings, reason, command
 ):
     data, arrays = synthetic()
-    data["anisotropy"][index] = {"value": -361.25, "low": 0.5, "high": None, "note": "open"}
+    data["anisotropy"][index] = {"value": 361.25, "low": 0.5, "high": None, "note": "open"}
     data["eigenvalues"]["min"] |= {"reason": reason, "matvecs": 15}
     asked = {f"settings.{name}": value for name, value in settings.items()}
     data["provenance"] |= {"fingerprint": plain(Fingerprint({}, asked, "00"))}
@@ -464,13 +483,13 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
 
 def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution(tmp_path):
     data, arrays = synthetic()
-    data["anisotropy"]["share"] = {"value": 361.25, "low": 15.0, "high": 151.0, "note": "4 start vectors"}
-    (line,) = (line for line in findings(probe_of(data)) if line.text.startswith("Share"))
+    data["anisotropy"]["saddle"] = {"value": 97.31, "low": 15.0, "high": 151.0, "note": "4 start vectors"}
+    (line,) = (line for line in findings(probe_of(data)) if line.text.startswith("Saddle"))
     assert line.level == "caution" and "– (between 15.0 and 151)" in line.text
     text = Page(page(tmp_path / "probe", data, arrays)).text
-    assert "361" not in text
-    data["anisotropy"]["share"]["high"] = 149.0
-    assert not any(line.text.startswith("Share") for line in findings(probe_of(data)))
+    assert "97.3" not in text
+    data["anisotropy"]["saddle"]["high"] = 149.0
+    assert not any(line.text.startswith("Saddle") for line in findings(probe_of(data)))
 
 
 def test_names_and_notes_that_look_like_markup_are_printed_as_they_are():

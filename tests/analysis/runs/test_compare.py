@@ -52,7 +52,8 @@ def record(folder: Path, scale: float, **changes) -> None:
     index = {"value": 7.0 * scale, "low": 6.0 * scale, "high": 9.0 * scale, "note": ""}
     names = ("literal", "saddle", "share", "effective_rank")
     family = {"gaussians": 10091, "dim": 30273, "rank": 30000, "lambda_max": end, "lambda_min": end}
-    family |= {"indices": dict.fromkeys(names, index)}
+    share = {name: value / 10 if name != "note" else value for name, value in index.items()}
+    family |= {"indices": dict.fromkeys(names, index) | {"share": share}}
     data["families"] = [about | family, about | family | {"split": True, "gaussians": 20000}]
     written(folder, data, arrays)
 

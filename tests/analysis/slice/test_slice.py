@@ -172,10 +172,10 @@ def test_a_probe_and_eigenvectors_that_cannot_be_read_are_named(run, tmp_path, c
     kept = load_checkpoint(path).fingerprint({}, 0).but("settings", "seed").digest
     unfinished = out.with_name(f".{out.name}.unfinished") / kept
     unfinished.mkdir(parents=True)
-    (unfinished / "eigenvectors.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', ")
+    (unfinished / "eigenvectors.npz").write_bytes(b"PK\x03\x04\x93NUMPY\x01\x00v\x00{'descr': '<f8', ")
     record = sliced(out, path, "--scene", str(run.parent / "still"), "--dimension", "1", *POINTS)
     said = " ".join(capsys.readouterr().out.split())
-    for note, file in zip(record.data.notes, ("eigenvectors.npy", "probe.json"), strict=True):
+    for note, file in zip(record.data.notes, ("eigenvectors.npz", "probe.json"), strict=True):
         assert file in note and "damaged" in note and note in said
 
 

@@ -6,6 +6,7 @@ import torch
 
 from landscape.slices.refinement import SliceSettings
 from landscape.slices.slices import evaluate_slice, symmetric_axis
+from splat.model.untrusted import KeptArrays
 from tests.waiting import PATIENCE
 
 CENTER = torch.linspace(-1, 1, 6, dtype=torch.float64)
@@ -28,9 +29,9 @@ class Objective:
 
 
 def sliced(objective, store, center=CENTER, axes=AXES, **settings):
-    generator = torch.Generator().manual_seed(3)
+    generator, kept = torch.Generator().manual_seed(3), None if store is None else KeptArrays(store)
     return evaluate_slice(
-        objective, center, SPANS, axes, settings=SliceSettings(**settings), generator=generator, store=store
+        objective, center, SPANS, axes, settings=SliceSettings(**settings), generator=generator, store=kept
     )
 
 

@@ -1,20 +1,35 @@
-"""Arrays that promise more than their files hold are refused before memory is asked for."""
+"""What promises more than its file holds is refused before memory is asked for; what is written is whole or not at all."""
 
-import os
-import signal
-import time
+import ast
+import re
 import tracemalloc
 import zipfile
+from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from analysis.console.interruption import Interrupted, raising
-from analysis.records.records import _archive
 from landscape.errors import InputError
-from splat.model.untrusted import inside, locked, read_array
+from splat.model import untrusted
+from splat.model.untrusted import (
+    NAME,
+    inside,
+    loose_json,
+    read_array,
+    read_arrays,
+    read_json,
+    read_picture,
+    read_toml,
+    replacing,
+    require_name,
+    short,
+    write_atomically,
+)
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def with_header(length: bytes, header: bytes, version: int) -> bytes:
@@ -40,8 +55,8 @@ def test_what_an_array_promises_is_compared_with_what_there_is(tmp_path, name):
         pytest.raises(InputError, match=r"no array of numbers \(it promises"),
     ):
         read_array(file)
-    with (tmp_path / "bomb.npz").open("rb") as file, pytest.raises(ValueError, match="it promises"):
-        _archive(file)
+    with pytest.raises(InputError, match="it promises"):
+        read_arrays(tmp_path / "bomb.npz")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**20
@@ -64,11 +79,96 @@ def test_names_that_lead_out_are_refused_and_others_are_not(tmp_path, monkeypatc
     assert inside(Path("."), "a/../b") == Path("a/../b") and inside(Path("."), str(tmp_path / "b")) == tmp_path / "b"
 
 
-def test_a_signal_while_a_lock_is_taken_leaves_no_file(tmp_path, monkeypatch):
-    def flock(*_: object) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
+@pytest.mark.parametrize("name", ["..", "../x", "/x", "a/b", "", ".hidden", "a\0b", "a\n", "a\x1b[2J", "n" * 101])
+def test_names_that_are_not_fit_for_a_file_or_folder_are_refused(name):
+    with pytest.raises(InputError, match="as it names a folder"):
+        require_name(name)
+    assert re.match(NAME, "view-000") and require_name("fern 2.1+x") == "fern 2.1+x"
 
-    monkeypatch.setattr("splat.model.untrusted.fcntl.flock", flock)
-    with pytest.raises(Interrupted), raising(), locked(tmp_path / ".lock", "a run"):
-        time.sleep(5)
-    assert list(tmp_path.iterdir()) == []
+
+@pytest.mark.parametrize(
+    ("read", "content"),
+    [
+        (read_json, b"[" * 5000), (read_json, b"{"), (read_json, b'"\xff"'), (read_toml, b"a = " + b"[" * 5000),
+        (read_toml, b"a = " + b"9" * 6000), (read_toml, b"\xff"), (read_picture, b"GIF89a"), (read_picture, b""),
+        (read_arrays, b"PK"), (read_arrays, b"not an archive"),
+    ],
+)  # fmt: skip
+def test_what_is_none_is_refused_in_a_sentence_that_names_the_file(tmp_path, read, content):
+    (tmp_path / "file").write_bytes(content)
+    with pytest.raises(InputError, match=f"in {tmp_path / 'file'}, got a damaged file"):
+        read(tmp_path / "file")
+    with pytest.raises(FileNotFoundError):
+        read(tmp_path / "none")
+
+
+@pytest.mark.parametrize("content", ["[" * 10**5, "9" * 6000, "{", '{"a": 01}'])
+def test_json_of_other_tools_is_read_as_python_does_or_refused(content):
+    assert loose_json('{"a": NaN, "b": 3}', parse_int=float)["b"] == 3.0
+    with pytest.raises(InputError, match="no JSON"):
+        loose_json(content)
+
+
+def test_pictures_and_texts_have_a_greatest_size(tmp_path, monkeypatch):
+    Image.new("L", (2**14, 2**12 + 1)).save(tmp_path / "large.png")
+    with pytest.raises(InputError, match="of at most 67,108,864"):
+        read_picture(tmp_path / "large.png")
+    monkeypatch.setattr(untrusted, "MOST_TEXT", 3)
+    (tmp_path / "text").write_text("[12]")
+    with pytest.raises(InputError, match="4 bytes, of at most 3"):
+        read_json(tmp_path / "text")
+
+
+@pytest.mark.parametrize("dies", ["in the block", "between the renames", "no"])
+def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch, dies):
+    out = tmp_path / "out"
+    with replacing(out, folder=True) as partial:
+        (partial / "file").write_text("old")
+
+    def replace_by(text: str) -> None:
+        with replacing(out, folder=True) as partial:
+            (partial / "file").write_text(text)
+            if dies == "in the block":
+                raise KeyboardInterrupt
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    if dies == "between the renames":
+        monkeypatch.setattr(untrusted.os, "replace", interrupted)
+    with nullcontext() if dies == "no" else pytest.raises(KeyboardInterrupt):
+        replace_by("new")
+    assert (out / "file").read_text() == ("new" if dies == "no" else "old")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_name_as_long_as_the_system_allows_can_be_written(tmp_path):
+    path = tmp_path / ("é" * 125 + ".png")  # 254 bytes
+    write_atomically(path, b"picture")
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    assert len(short("x" * 201)) < 40 and short("x" * 201) != short("x" * 202) and short("x" * 200) == "x" * 200
+
+
+BARE = {"np.load", "json.load", "json.loads", "msgspec.json.decode", "tomllib.load", "tomllib.loads", "pickle.load"}
+
+
+def test_files_are_read_by_one_module_and_text_is_utf_8():
+    """Whatever the locale is; bare readers know no bounds."""
+    found = set()
+    for layer in ("landscape", "splat", "analysis", "figures"):
+        for path in (ROOT / layer).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and _is_bare(node):
+                    found.add((path.relative_to(ROOT).as_posix(), ast.unparse(node.func)))
+    readers = ("json.loads", "msgspec.json.decode", "tomllib.loads")
+    assert found == {("splat/model/untrusted.py", name) for name in readers}
+
+
+def _is_bare(call: ast.Call) -> bool:
+    name, named = ast.unparse(call.func), {each.arg for each in call.keywords}
+    modes = [each.value for each in call.args if isinstance(each, ast.Constant) and isinstance(each.value, str)]
+    if name == "open" or (name.endswith(".open") and modes and set(modes[0]) <= set("rwabt+")):
+        return "encoding" not in named and not any("b" in each for each in modes)
+    if name.endswith((".read_text", ".write_text")):
+        return "encoding" not in named
+    return name in BARE

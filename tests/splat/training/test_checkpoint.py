@@ -383,3 +383,12 @@ def test_a_checkpoint_says_what_was_seen_of_every_view(path):
     del content["scene"]["views"]["view1"]
     torch.save(content, path)
     refused(path, "it does not say what was seen of 1 of its views, such as 'view1'")
+
+
+@pytest.mark.parametrize("name", ["train.csv", "probe/probe.json", "metrics.json"])
+def test_another_file_of_a_run_is_refused_by_the_name_of_the_run(tmp_path, name):
+    (tmp_path / "probe").mkdir()
+    (tmp_path / "checkpoint.pt").write_bytes(b"")
+    (tmp_path / name).write_text("{}")
+    with pytest.raises(InputError, match=f"another file of the run {tmp_path}; name that run"):
+        load_checkpoint(tmp_path / name)

@@ -198,3 +198,18 @@ def test_a_changed_source_or_width_gets_kernels_of_its_own(tmp_path, monkeypatch
     assert before.is_relative_to(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "elsewhere"))
     assert kernel_cache.kernel_folder(256).parent == tmp_path / "elsewhere"
+
+
+@pytest.mark.parametrize(("mode", "ours"), [(0o755, True), (0o777, False), (0o757, False), (0o1777, False)])
+def test_kernels_are_not_run_from_where_others_may_write(tmp_path, mode, ours):
+    from splat.backend.cpu.kernel_cache import _is_ours, _is_this_users
+
+    (tmp_path / "kernels").mkdir()
+    (tmp_path / "kernels").chmod(mode)
+    assert _is_ours(tmp_path / "kernels") == ours
+    (tmp_path / "kernels/inner").mkdir(mode=0o755)
+    assert _is_ours(tmp_path / "kernels/inner") == ours
+    (tmp_path / "kernels").chmod(0o775)
+    assert _is_ours(tmp_path / "kernels")  # of this user's own group
+    group = os.stat_result([0o40775, 0, 0, 0, os.getuid(), os.getgid() + 1, 0, 0, 0, 0])
+    assert not _is_this_users(group)
