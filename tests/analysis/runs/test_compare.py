@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from analysis.runs.claims.study import row_of
 from PIL import Image
 
 from analysis.commands.cli import main
@@ -20,6 +19,7 @@ from analysis.records.tables import bracketed
 from analysis.runs import compared
 from figures.compare import draw_comparison
 from landscape.errors import InputError
+from notebooks.paper.study import row_of
 from splat.losses.reference import LossSettings
 from splat.model.files.splat_ply import splat_ply
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
