@@ -10,7 +10,7 @@ loss, psnr         of the first training view as it would be rendered then: the 
 seconds, cpu       that the steps so far took, by the clock and of all processors together, without loading, saving and scoring
 """
 
-from math import isnan, nan
+from math import inf, isnan, nan
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from analysis.console.plain import say
 from analysis.train.training_time import TrainingTime
 from landscape.errors import InputError
 from splat.losses.autograd import view_loss
@@ -32,6 +33,10 @@ from splat.training.state import Training
 
 LOG, TENSORBOARD = "train.csv", "tensorboard"
 COLUMNS = ("step", "loss", "psnr", "gaussians", "seconds", "cpu")
+EARLY, FAST = (
+    0.1,
+    3,
+)  # a run whose Gaussians become more than so many times those of its start in this share of it says why
 SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
 
 
@@ -46,6 +51,7 @@ class TrainingProgress:
     ) -> None:
         self.training, self.view, self.every, self.console = training, view, every, console
         self.loss, self.begun = nan, (training.step, 0.0)
+        self.most = inf if training.step else FAST * len(training.gaussians)  # Gaussians, before it says why
         self.scalars: Any = None
         if tensorboard:
             self.scalars = scalar_writer()(str(run / TENSORBOARD), purge_step=training.step + 1)
@@ -86,8 +92,23 @@ class TrainingProgress:
         self.loss = done.loss if isnan(self.loss) else self.loss + SMOOTHING * (done.loss - self.loss)
         state = f"loss {self.loss:.4f} {done.gaussians} Gaussians"
         self.bars.update(self.bar, completed=done.step, state=state)
+        if done.gaussians > self.most and done.step <= EARLY * self.training.config.iterations:
+            say(self._grown(done), style="yellow", console=self.console)
+            self.most = inf
         if done.step % self.every == 0 or done.step == self.training.config.iterations:
             self._row(spent)
+
+    def _grown(self, done: StepResult) -> str:
+        """Why there are many more Gaussians than at the start so early."""
+        iterations = self.training.config.iterations
+        settings = self.training.config.method.density_control(self.training.config)
+        rounds = [n for n in range(1, done.step + 1) if settings.densifies(n, iterations)]
+        return (
+            f"step {done.step}: {done.gaussians:,} Gaussians, more than {FAST} times those of the start: each of {len(rounds)} "
+            f"rounds of density control since step {rounds[0]} adds one for each Gaussian whose screen gradient is above "
+            f"densify.gradient_threshold = {settings.gradient_threshold:g}, which few are not until the image fits; a "
+            "higher threshold, or a later densify.start, adds fewer"
+        )
 
     def _row(self, spent: TrainingTime) -> None:
         """Write a row, and say it where there is no bar."""

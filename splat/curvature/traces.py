@@ -14,7 +14,8 @@ over pixels, l'' = D and the traces are exact.
 (`analysis/measures/depth.py`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from math import sqrt
 from time import monotonic
@@ -96,6 +97,40 @@ def block_traces(objective: SceneObjective) -> dict[str, TraceEstimate]:
         dim = objective.block_dims[name]
         found[name] = TraceEstimate.exact(name, dim, value, ONE_PERCENT.confidence, terms=terms)
     return found
+
+
+def coupling_ratios(objective: SceneObjective, traces: Mapping[str, TraceEstimate]) -> dict[str, tuple[float, float]]:
+    """E[x - y] of estimated traces and its standard error, in units of C_b, by name: for `carried_traces`."""
+    known, pixelwise = _pixel_traces(objective, traces)
+    unit = {name: pixelwise.get(name, 0.0) or 1.0 for name in traces}  # C_b = 0: no coupling, and nothing was sampled
+    return {
+        name: ((trace.value - known[name]) / unit[name], abs(trace.standard_error / unit[name]))
+        for name, trace in traces.items()
+    }
+
+
+def carried_traces(objective: SceneObjective, ratios: Mapping[str, tuple[float, float]]) -> dict[str, TraceEstimate]:
+    """Traces without sampling, where E[x - y] / C_b is as `coupling_ratios` found it elsewhere, for instance some steps before.
+
+    standard_error: that of the ratio alone, not of its change since.
+    """
+    known, pixelwise = _pixel_traces(objective, ratios)
+    found = {}
+    for name, (ratio, error) in ratios.items():
+        unit = pixelwise.get(name, 0.0)
+        trace = TraceEstimate.exact(
+            name, objective.block_dims[name], known[name] + ratio * unit, ONE_PERCENT.confidence
+        )
+        found[name] = replace(trace, standard_error=error * abs(unit))
+    return found
+
+
+def _pixel_traces(objective: SceneObjective, names: Collection[str]) -> tuple[dict[str, float], dict[str, float]]:
+    """T_b and C_b of the named blocks; no C_b where the loss does not couple pixels."""
+    whole, coupled = (
+        {} if blocks is None else blocks.traces(objective.active.quats) for blocks in objective.approximate_blocks
+    )
+    return {name: whole[name] for name in names}, coupled
 
 
 def curvature_scale(trace: float, parameters: int, gaussians: int, dimension: Dimension) -> float:

@@ -46,7 +46,9 @@ class DensifySettings(Settings):
     """Settings of density control in a run of T steps: after min(start, start_share T), before min(stop, stop_share T).
 
     The interval is `every`, but at most every_share T.  In the 30,000 steps of 3DGS the shares change nothing; with them short
-    runs densify too, and have half of their steps to settle.
+    runs densify too, and have half of their steps to settle.  While the image does not fit, a round makes 1.6 to 1.7 Gaussians
+    of one, 3 steps after the last as 100 steps after it (LLFF's fern): what counts is how many rounds there are, and a run of
+    at most 5000 steps has none in its first tenth.
 
     gradient_threshold: of the mean screen-space gradient, in normalised device coordinates.  clone_scale, prune_scale: in units
     of the extent; None: no Gaussian is removed for its size.  split_distance: in world units, see above; None: none is split

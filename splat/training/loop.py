@@ -19,8 +19,9 @@ The published code (graphdeco-inria/gaussian-splatting, train.py) orders a step 
     SH degree   rises before the renders of the steps 1000, 2000, 3000; here before those of 1001, 2001, 3001
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import isfinite
 
 import torch
@@ -28,8 +29,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from splat.losses.autograd import Clamped
+from splat.losses.protocols import ViewLoss
 from splat.scenes.view import View
-from splat.training.state import Step, Training
+from splat.training.state import Step, TrainConfig, Training
 
 
 @dataclass(frozen=True)
@@ -45,14 +48,15 @@ class StepResult:
 def prepare(training: Training, views: Sequence[View]) -> None:
     """Get ready for steps on these views; a second call changes nothing.
 
-    InputError where there are no views, they lack what the method needs, or the method would never act.
+    InputError where there are no views, they lack what the method needs, or no part of the method would begin.  A method of
+    which every part is switched off is 3DGS, the base that it is compared with.
     """
     config = training.config
     if not views:
         raise InputError("expected at least one view to train on, got none")
     parts = config.method.parts(config)
-    if all(begins >= config.iterations for begins in parts.values()):
-        late = ", ".join(f"{name} = {begins}" for name, begins in parts.items()) or "all of it is switched off"
+    if parts and all(begins >= config.iterations for begins in parts.values()):
+        late = ", ".join(f"{name} = {begins}" for name, begins in parts.items())
         raise InputError(
             f"expected a training in which the method acts, got {config.method.name} which never does in "
             f"{config.iterations} steps ({late}); take more steps, let it begin earlier, or use the method 3dgs"
@@ -82,14 +86,11 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
         number = training.step + 1
         training.raise_sh_degree(min(config.sh_degree, (number - 1) // config.sh_degree_every))
         chosen = training.next_view(len(views))
-        view, background = views[chosen], config.background_colour(dtype)
+        background, against = config.background_colour(dtype), loss_of
         if config.random_background:
             drawn = torch.rand(3, generator=training.generator, dtype=dtype)
-            target = with_background(view, background, drawn)
-            background, loss = drawn, config.loss_against(target, training.gaussians.flat)
-        else:
-            loss = loss_of(chosen)
-        step = Step(number, training, training.gaussians, views, chosen, background, loss)
+            background, against = drawn, losses_on(drawn, config, views, training.gaussians.flat)
+        step = Step(number, training, training.gaussians, views, chosen, background, against)
 
         value = method.own_step(step)
         value = photometric_step(step) if value is None else value
@@ -97,7 +98,7 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
         method.after_step(step)
         training.update_filter(number, cameras)
         training.step = number
-        yield StepResult(number, value, len(training.gaussians), view.name)
+        yield StepResult(number, value, len(training.gaussians), views[chosen].name)
 
 
 def photometric_step(step: Step) -> float:
@@ -114,6 +115,14 @@ def photometric_step(step: Step) -> float:
     training.descend(found.gradient, step.number)
     training.control_density(step.number, step.camera, found)
     return base.loss
+
+
+def losses_on(
+    drawn: Float[Tensor, "3"], config: TrainConfig, views: Sequence[View], like: Tensor
+) -> Callable[[int], ViewLoss | Clamped]:
+    """A function from a view's index to the loss against its image on this background; like: see `TrainConfig.loss_against`."""
+    usual = config.background_colour(drawn.dtype)
+    return cache(lambda index: config.loss_against(with_background(views[index], usual, drawn), like))
 
 
 def with_background(view: View, old: Float[Tensor, "3"], new: Float[Tensor, "3"]) -> Float[Tensor, "3 h w"]:

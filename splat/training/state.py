@@ -49,8 +49,8 @@ Row = dict[str, Count | float | bool | str]  # of `Method.history`
 class Step:
     """One step of a training.
 
-    number: from 1.  gaussians: before the update.  chosen: index in `views` of the sampled view.  background: RGB.  loss:
-    against the sampled view's image on that background.
+    number: from 1.  gaussians: before the update.  chosen: index in `views` of the sampled view.  background: RGB.  loss_of:
+    the loss against the image of a view, by its index, on that background.
     """
 
     number: int
@@ -59,7 +59,7 @@ class Step:
     views: Sequence[View]
     chosen: int
     background: Float[Tensor, "3"]
-    loss: ViewLoss | Clamped
+    loss_of: Callable[[int], ViewLoss | Clamped]
 
     @property
     def config(self) -> "TrainConfig":
@@ -68,8 +68,15 @@ class Step:
     def loss_and_gradient(
         self, gaussians: Gaussians, opacity_scale: Float[Tensor, " n"] | None = None
     ) -> LossAndGradient:
-        """Loss and gradient of the sampled view, with the regularisers, at these Gaussians.  opacity_scale: see `render`."""
-        found = loss_and_gradient(gaussians, self.camera, self.loss, self.background, self.config.render, opacity_scale)
+        """`of_view` of the sampled view."""
+        return self.of_view(self.chosen, gaussians, opacity_scale)
+
+    def of_view(
+        self, index: int, gaussians: Gaussians, opacity_scale: Float[Tensor, " n"] | None = None
+    ) -> LossAndGradient:
+        """Loss and gradient of a view, with the regularisers, at these Gaussians.  opacity_scale: see `render`."""
+        camera, loss = self.views[index].camera, self.loss_of(index)
+        found = loss_and_gradient(gaussians, camera, loss, self.background, self.config.render, opacity_scale)
         regularizers = Regularizers(gaussians, self.config.loss, len(gaussians))
         return replace(found, loss=found.loss + regularizers.value, gradient=regularizers.add_gradient(found.gradient))
 

@@ -41,7 +41,7 @@ from splat.model.typed import Count, NonNegative, Positive
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.scenes.view import View
 from splat.training.densify import Densified
-from splat.training.methods.agreement import agreement_gradients
+from splat.training.methods.agreement import agreement
 from splat.training.state import Method, MethodSettings, Step, ThreeDGS, TrainConfig, Training
 
 
@@ -89,9 +89,9 @@ class CoRGSMethod(Method[CoRGS]):
         other = step.loss_and_gradient(partner.gaussians)
         if settings.weight and step.number > settings.pseudo_start:
             pose = pseudo_view([view.camera for view in step.views], settings.noise, self.generator)
-            if found := agreement_gradients(step, (step.gaussians, partner.gaussians), pose):
-                base = replace(base, gradient=base.gradient + settings.weight * found[0])
-                other = replace(other, gradient=other.gradient + settings.weight * found[1])
+            if found := agreement(step, (step.gaussians, partner.gaussians), pose):
+                base = replace(base, gradient=base.gradient + settings.weight * found.gradient(0))
+                other = replace(other, gradient=other.gradient + settings.weight * found.gradient(1))
         partner.descend(other.gradient, step.number)
         partner.control_density(step.number, step.camera, other)
         partner.update_filter(step.number, [view.camera for view in step.views])

@@ -104,6 +104,16 @@ def test_off_a_terminal_every_row_is_a_line_with_the_time_left(scene, tmp_path, 
         assert line.endswith(" s left") == (row["step"] in (10, 20))
 
 
+def test_gaussians_that_more_than_triple_in_the_first_tenth_are_said_with_the_reason(scene, tmp_path, capsys):
+    fast = ["start=0", "every=1", "gradient_threshold=1e-9"]
+    for name, settings in {"usual": fast[1:], "fast": fast}.items():
+        changes = [word for setting in settings for word in ("--set", f"densify.{setting}")]
+        assert main(words(scene, tmp_path / name, *changes)) == 0
+        said = " ".join(capsys.readouterr().err.split())
+        why = "more than 3 times those of the start: each of 2 rounds of density control since step 1 adds one for each"
+        assert (why in said) == (name == "fast") and said.count("times those of the start") == (name == "fast")
+
+
 def test_tensorboard_is_given_the_rows(scene, tmp_path):
     reader = "tensorboard.backend.event_processing.event_accumulator"
     package = pytest.importorskip(reader, reason="pip install -e '.[tensorboard]'")

@@ -206,12 +206,11 @@ def test_a_method_that_would_never_act_is_refused_before_there_is_a_folder(origi
 
 
 def test_the_schedule_of_stablegs_is_scaled_to_the_length_and_said(original, tmp_path, capsys):
-    assert train(original, tmp_path / "scaled", "--method", "stablegs", "--set", "densify.stop=7") == 0
+    assert train(original, tmp_path / "scaled", "--method", "stablegs") == 0
     said = " ".join(capsys.readouterr().err.split())
     config = load_checkpoint(tmp_path / "scaled" / "checkpoint.pt").training.config
-    assert f"stablegs: its published schedule is scaled to {config.iterations} steps: densify.start 500 to" in said
-    assert "warm_up 1000 to 0;" in said and "stop" not in said
-    assert config.method == StableGS(warm_up=0) and config.densify.stop == 7
+    assert f"stablegs: its published schedule is scaled to {config.iterations} steps: warm_up 1000 to 0;" in said
+    assert config.method == StableGS(warm_up=0) and config.densify == DensifySettings()
 
 
 def test_a_part_of_a_method_that_a_run_does_not_reach_is_pointed_out():

@@ -268,7 +268,7 @@ def test_a_ply_file_is_refused_by_its_name(tmp_path):
         ("seed", -1, "'config.seed': expected int >= 0, got -1"),
         ("loss", {"pixel": "l1"}, "'config' has missing or unknown keys: loss.eps, loss.literal, loss.ssim_weight"),
         ("method", {"name": "magic"}, "'config.method' has the unknown name 'magic'"),
-        ("method", {"name": "stablegs"}, "'config' has missing or unknown keys: method.asp_weight"),
+        ("method", {"name": "stablegs"}, "'config' has missing or unknown keys: method.accuracy"),
         ("method", "3dgs", "'config.method': expected object, got str"),
         ("method", {"name": torch.zeros(2000)}, "'config.method.name': expected str, got Tensor"),
         ("iterations", torch.zeros(50, 50), "'config.iterations': expected int, got Tensor"),

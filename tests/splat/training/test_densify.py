@@ -184,6 +184,17 @@ def test_short_runs_densify_in_their_second_quarter():
     assert steps(2000, "resets_opacity", white=False) == []
 
 
+@pytest.mark.parametrize("iterations", [20, 60, 200, 400, 1000, 3000, 5000])
+def test_no_gaussian_is_added_in_the_first_tenth_of_a_run_of_up_to_5000_steps(iterations):
+    rounds = steps(iterations, "densifies")
+    assert rounds and min(rounds) > max(iterations / 10, iterations / 4 if iterations < 2000 else 500)
+
+
+def test_a_round_of_density_control_at_most_doubles_the_gaussians():
+    many = gaussians_of_sizes(0.5, 0.9, 2.0, 12.0)
+    assert len(run(many, [HIGH] * 4).parents) == 2 * len(many)
+
+
 @pytest.mark.parametrize(("iterations", "last"), [(2000, 500), (400, 100), (30, 7), (3, None)])
 def test_on_white_opacities_are_reset_just_before_density_control_begins(iterations, last):
     assert steps(iterations, "resets_opacity", white=True) == ([] if last is None else [last])

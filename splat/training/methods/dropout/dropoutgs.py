@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from splat.model.typed import Positive
 from splat.render.loss_and_gradient import LossAndGradient
-from splat.training.methods.agreement import agreement_gradients
+from splat.training.methods.agreement import agreement
 from splat.training.methods.dropout.dropgaussian import dropout
 from splat.training.state import Method, MethodSettings, Step
 
@@ -42,5 +42,7 @@ class DropoutGSMethod(Method[DropoutGS]):
         keep = dropout(len(step.gaussians), self.settings.p, step.gaussians.flat.dtype, self.generator)
         fields, scales = (step.gaussians, step.gaussians), (None, keep)
         loss = replace(step.config.loss, literal=False)
-        found = agreement_gradients(step, fields, step.camera, scales, self.settings.weight, loss)
-        return base if found is None else replace(base, gradient=base.gradient + (found[0] + found[1]))
+        found = agreement(step, fields, step.camera, scales, self.settings.weight, loss)
+        if found is None:
+            return base
+        return replace(base, gradient=base.gradient + (found.gradient(0) + found.gradient(1)))

@@ -3,6 +3,10 @@
     tau     sqrt(max(tr H, 0) / dim) of an attribute's block, `splat.curvature.traces.curvature_scale`; for quats on the unit
             sphere, without radial directions, since H_quats scales with 1 / |q|^2
     rho     c / (tau + eps), at most the attribute's cap                                                       Eq. (5)
+    rise    of the quadratic model under a random probe, 1/2 E[step H step] = rho^2 tr(H) / 2 = c^2 dim / 2: by the constants
+            alone, whatever the scene; for quats with rho per radian a quarter of it.  Where `dose` is "equal", every
+            attribute's c is the one whose rise is the mean of these.  Not in it: the slope along which means and opacities
+            step, the kinks of an l1 loss, the weights of SH bands and the shares of rotations
     g       the gradient of the sampled view's loss
     v       the unit vector from that view's camera centre to the mean
     means   + rho u,  u the direction of gamma g_depth + (1 - gamma) g_lateral,  g_depth = (g.v) v             Eqs. (7), (8)
@@ -18,11 +22,14 @@ of the probed copy from other poses.
 
 The step counts as a constant, as in SAM: with Theta' = Theta + step (Eq. (14)), dTheta' / dTheta is the identity, except for
 quaternions: there it is right multiplication by exp(omega), an orthogonal matrix.
+
+rho of quats: tr(H_q) is per unit of a unit quaternion, which is two radians.  `rotation_unit` says what rho is a length in.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import inf, isfinite, isqrt
+from math import inf, isfinite, isqrt, sqrt
+from statistics import fmean
 from typing import Annotated, Literal
 
 import torch
@@ -74,7 +81,8 @@ class ProbeSettings(Settings):
 
     attributes: those that are probed, if their c is above 0.  dimension: dim of tau (`splat.curvature.traces.curvature_scale`);
     by default not "active", with which rho is larger by the root of the number of Gaussians, and at its cap in all but tiny
-    scenes.  gamma: 1 for steps of means along the viewing ray, 0.5 along the gradient itself.
+    scenes.  gamma: 1 for steps of means along the viewing ray, 0.5 along the gradient itself.  dose: each attribute's own c, or
+    an equal rise.  rotation_unit: of c / (tau + eps) for quats; the cap is in radians in either.
     """
 
     attributes: tuple[Attribute, ...] = ("means", "log_scales", "quats", "opacity_logits", "sh")
@@ -84,6 +92,8 @@ class ProbeSettings(Settings):
     eps: Positive = 1e-6
     gamma: Share = 0.7
     kappa_full: Positive = NEEDLE
+    dose: Literal["constants", "equal"] = "constants"
+    rotation_unit: Literal["radian", "quaternion"] = "radian"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -126,14 +136,21 @@ def magnitudes(
     if active < 1 or not 0 < extent < inf:
         raise ValueError(f"expected at least 1 active Gaussian and a finite extent above 0, got {active} and {extent}")
     dimensions = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 3 * (sh_degree + 1) ** 2}
+    turn = {"radian": 1.0, "quaternion": 2.0}[settings.rotation_unit]
+    c = {name: getattr(settings.c, name) * (turn if name == "quats" else 1) for name in settings.on}
+    if settings.dose == "equal" and c:
+        # c^2 dim / 2 of steps in the parameters: of a quaternion they are half of the radians
+        unit = {name: 0.5 if name == "quats" else 1.0 for name in c}
+        rise = fmean((unit[name] * c[name]) ** 2 * dimensions[name] / 2 for name in c)
+        c = {name: sqrt(2 * rise / dimensions[name]) / unit[name] for name in c}
     result = {}
     for name in settings.on:
-        c, cap = getattr(settings.c, name), getattr(settings.caps, name)
+        cap = getattr(settings.caps, name)
         trace = traces.get(name)
         if trace is None or not isfinite(trace):
             raise InputError(f"expected a finite trace of {name}, got {trace}; lower the rates or leave {name} out")
         tau = curvature_scale(trace, dimensions[name] * active, active, settings.dimension)
-        rho = c / (tau + settings.eps)
+        rho = c[name] / (tau + settings.eps)
         result[name] = Magnitude(trace, tau, rho, min(rho, cap * extent if name == "means" else cap))
     return result
 
@@ -155,6 +172,24 @@ class Probed:
         return gradient
 
 
+def draw_seeds(generator: torch.Generator) -> list[int]:
+    """Seeds of `draw_steps`."""
+    return torch.randint(2**63 - 1, (len(DRAWN),), generator=generator).tolist()
+
+
+def draw_steps(gaussians: Gaussians, names: Collection[str], seeds: Sequence[int]) -> dict[str, Tensor]:
+    """Standard normal numbers for the random steps of the named attributes, of quats for omega.
+
+    Each attribute in DRAWN has a generator of its own: what else is probed does not change its numbers.
+    """
+    shapes = {"quats": gaussians.means, "log_scales": gaussians.log_scales, "sh": gaussians.sh}
+    return {
+        name: torch.empty_like(shapes[name]).normal_(generator=torch.Generator(gaussians.flat.device).manual_seed(seed))
+        for name, seed in zip(DRAWN, seeds, strict=True)
+        if name in names
+    }
+
+
 @torch.no_grad()
 def probe_attributes(
     gaussians: Gaussians,
@@ -163,34 +198,30 @@ def probe_attributes(
     splats: Splats,
     magnitudes: Mapping[str, Magnitude],
     settings: ProbeSettings,
-    generator: torch.Generator,
+    draws: Mapping[str, Tensor],
+    sign: float = 1.0,
 ) -> Probed:
     """The Gaussians after a step of each attribute by its magnitude; attributes without a magnitude stay.
 
-    camera, gradient, splats: of the sampled view, its loss and its render.  Each attribute in DRAWN has a separate generator,
-    seeded from `generator` even where it is not probed: so no probe changes the draws of another or the state of `generator`.
+    camera, gradient, splats: of the sampled view, its loss and its render.  draws: of `draw_steps`; sign: their factor.
     """
     probed = gaussians.with_flat(torch.zeros_like(gaussians.flat))  # the step, until the Gaussians are added
     step, slope = probed.attributes, gaussians.with_flat(gradient).attributes
     rho = {name: magnitude.rho for name, magnitude in magnitudes.items()}
-    seeds = torch.randint(2**63 - 1, (len(DRAWN),), generator=generator).tolist()
-    draws = {
-        name: torch.Generator(probed.flat.device).manual_seed(seed) for name, seed in zip(DRAWN, seeds, strict=True)
-    }
     omega = torch.zeros_like(probed.means)
     if "means" in rho:
         rays = gaussians.means.double() - camera.centre.to(probed.flat.device)
         step["means"].copy_(rho["means"] * depth_biased(slope["means"], rays, settings.gamma))
     if "log_scales" in rho:
-        step["log_scales"].normal_(0, rho["log_scales"], generator=draws["log_scales"])
+        torch.mul(draws["log_scales"], sign * rho["log_scales"], out=step["log_scales"])
     if "quats" in rho:
         share = ((condition(splats.conics) - 1) / settings.kappa_full).clamp(0, 1) * on_screen(splats, camera)
-        omega.normal_(0, rho["quats"], generator=draws["quats"]).mul_(share[:, None])
+        omega.copy_(sign * rho["quats"] * draws["quats"] * share[:, None])
     if "opacity_logits" in rho:
         step["opacity_logits"].copy_(rho["opacity_logits"] * slope["opacity_logits"].sign())
     if "sh" in rho:
         weights = [1 + isqrt(k) / max(gaussians.sh_degree, 1) for k in range(step["sh"].shape[1])]
-        step["sh"].normal_(0, rho["sh"], generator=draws["sh"]).mul_(step["sh"].new_tensor(weights)[:, None])
+        torch.mul(draws["sh"], sign * rho["sh"] * step["sh"].new_tensor(weights)[:, None], out=step["sh"])
     turns = exponential(omega)
     probed.flat.add_(gaussians.flat)
     probed.quats.copy_(hamilton(gaussians.quats, turns))

@@ -3,20 +3,37 @@
     L = L_recon(Theta) + asp_weight L_recon(Theta') + vsp_weight mean_k l(I_k(Theta), I_k(Theta'))      Eqs. (15), (21), (22)
 
 Theta' is a probed copy of all Gaussians in all attributes (`attribute_probe.py`), new at every step.  The probe counts as
-constant: gradients in Theta' are pulled back to Theta through Eq. (14).  k are probed viewpoints (`viewpoint_probe.py`), one
-for each training view or only for the sampled one; l is the loss of training, between two renders.  L_recon is the loss of the
-sampled view, as in Algorithm 1.  There is no released code.
+constant: gradients in Theta' are pulled back to Theta through Eq. (14).  k are probed viewpoints (`viewpoint_probe.py`); l is
+the loss of training, between two renders.  There is no released code.
 
 Probing starts after `warm_up` steps.  A diagnosis every `every` steps computes the magnitudes rho from the traces of the
-Hessian's blocks over all training views, and the dominant occlusion edge of each view; both change slowly.  Density control
-uses the gradient of the sampled view only.  Where no training view sees a Gaussian, training continues with the last magnitudes
-and edges, or none.  The history notes this, and counts the probed viewpoints that see no Gaussian.
+Hessian's blocks over all training views, and the dominant occlusion edge of each view; both change slowly.  Density control is
+that of 3DGS, by the gradient of the sampled view only.  Where no training view sees a Gaussian, training continues with the
+last magnitudes and edges, or none.  The history notes this, and counts the probed viewpoints that see no Gaussian.
 
-Schedule.  The paper trains for 10,000 steps, 1,000 of them warm-up (Sec. 4, Algorithm 1).  Algorithm 1 densifies only after the
-warm-up (line 18), but the text builds on 3DGS, which begins after step 500: `densify_after_warm_up` chooses.  In a training of
-another length T, `StableGS.scaled` multiplies the warm-up and the first and last step of density control by T / 10,000, so that
-probing and densification overlap as in the paper; `landscape train` does so for settings that are not given.  The steps between
-two densifications and between resets of the opacities stay: in this time Gaussians move and become opaque again, whatever T.
+What the paper leaves open (more in `attribute_probe.py` and `viewpoint_probe.py`):
+
+    setting                default    what speaks for it                        what the other changes
+    vsp_gradient           both       Eq. (22) is differentiated whole, and     "probed": the base render is a target; one
+                                      Eq. (21) depends on Theta twice           backward pass less, another direction
+    asp_views              sampled    Algorithm 1, lines 9 and 13               "all": Eq. (15); M renders a step, not 1
+    viewpoints             one        a term of Eq. (21) has its mean           "all": Sec. 3.4, K = M; 2 M renders, not 2
+    probe.rotation_unit    radian     omega of Eq. (9) is an angle              "quaternion": the unit of tr(H_q); turns twice
+                                                                                as far, up to the cap
+    probe.dose             constants  one c = 0.01 for all (Sec. 4)             "equal": one rise of the loss for all
+    densify_after_warm_up  false      "we build on 3DGS", from step 500 on      true: Algorithm 1, line 18
+
+The same expectation for less:
+
+    viewpoints = "one"     drawn independently of the sampled view: the probe depends on that view, and its own viewpoint alone
+                           would have another mean than Eq. (21)
+    antithetic             two steps share the random numbers of the probe, with opposite signs: half the draws
+    sampled_every          the sampled part of a trace (see Accuracy) is new in one of so many diagnoses; the others take its
+                           last ratio to an exact part
+    vsp_share              the share of the steps that probe viewpoints, by chance, with the weight vsp_weight / vsp_share
+
+Schedule.  The paper trains for 10,000 steps, 1,000 of them warm-up (Sec. 4, Algorithm 1).  In a training of another length T,
+`StableGS.scaled` multiplies the warm-up by T / 10,000; `landscape train` does so unless it is given.
 
 Accuracy.  tr H_b has an exact part and a sampled one (`splat/curvature/traces.py`).  The number of samples, from 8 to
 MOST_SAMPLES, is such that the 95% interval of rho is within `accuracy`; rho depends on the root of the trace.  A trace that
@@ -32,6 +49,7 @@ from math import inf
 from typing import Annotated, Any, Literal
 
 import torch
+from jaxtyping import Float
 from msgspec import Meta
 from torch import Tensor
 
@@ -41,19 +59,23 @@ from landscape.traces.hutchinson import TraceSettings
 from landscape.traces.trace import PAPER, estimate_traces
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import NothingInSight, SceneObjective
-from splat.curvature.traces import LEAST_SAMPLES, exact_traces
+from splat.curvature.traces import LEAST_SAMPLES, carried_traces, coupling_ratios, exact_traces
 from splat.model.camera import Camera
 from splat.model.capture import capture_geometry
-from splat.model.typed import Count, Length, NonNegative, typed
+from splat.model.gaussians import Gaussians
+from splat.model.typed import LARGEST, Count, Length, NonNegative, typed
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render_depth
 from splat.scenes.view import View
 from splat.training.densify import DensifySettings
-from splat.training.methods.agreement import agreement_gradients
+from splat.training.methods.agreement import agreement
 from splat.training.methods.stablegs.attribute_probe import (
+    DRAWN,
     Attribute,
     Magnitude,
     ProbeSettings,
+    draw_seeds,
+    draw_steps,
     magnitudes,
     probe_attributes,
 )
@@ -63,6 +85,7 @@ from splat.training.state import Method, MethodSettings, Step, TrainConfig, Trai
 
 PAPERS_STEPS = 10_000
 MOST_SAMPLES = 64  # of a trace
+Ratio = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 
 
 @dataclass(frozen=True)
@@ -70,12 +93,13 @@ class StableGS(MethodSettings):
     """Settings of StableGS; by default the paper's.
 
     warm_up: steps before probing starts; every: steps between two diagnoses (magnitudes and edges).
-    asp_weight, vsp_weight: of the probed copy's loss, and of the agreement from probed viewpoints; 0 leaves it out.
-    traces: "exact": only the coupling between pixels is sampled; "paper": Eq. (6), ten Gaussian samples a block.
+    asp_weight, vsp_weight: of the probed copy's loss, and of the agreement from probed viewpoints; 0 leaves it out, both 0 make
+    it 3DGS.
+    traces: "exact": only the coupling between pixels is sampled, and only in one of sampled_every diagnoses; "paper": Eq. (6),
+    ten Gaussian samples a block, in each.
     accuracy: of rho with "exact" traces, relative, with 95% confidence; inf takes the fewest samples, four.
-    viewpoints: "all" is the paper's K = M probes a step, "one" K = 1, that of the sampled view.
     densify_after_warm_up: Gaussians are cloned, split and removed only after the warm-up.
-    probe, viewpoint: of the attribute probes and of the viewpoint probes.
+    probe, viewpoint: of the attribute probes and of the viewpoint probes.  The others: see above.
     """
 
     name: Literal["stablegs"] = "stablegs"
@@ -85,7 +109,12 @@ class StableGS(MethodSettings):
     vsp_weight: NonNegative = 0.5
     traces: Literal["exact", "paper"] = "exact"
     accuracy: Annotated[float, Meta(gt=0)] = 0.05
-    viewpoints: Literal["all", "one"] = "all"
+    sampled_every: Length = 10
+    asp_views: Literal["sampled", "all"] = "sampled"
+    viewpoints: Literal["all", "one"] = "one"
+    vsp_gradient: Literal["both", "probed"] = "both"
+    vsp_share: Annotated[float, Meta(gt=0, le=1)] = 1.0
+    antithetic: bool = True
     densify_after_warm_up: bool = False
     probe: ProbeSettings = field(default_factory=ProbeSettings)
     viewpoint: ViewpointSettings = field(default_factory=ViewpointSettings)
@@ -104,14 +133,8 @@ class StableGS(MethodSettings):
         return replace(config.densify, start=start, start_share=1.0)
 
     def scaled(self, config: TrainConfig, keep: Collection[str] = ()) -> TrainConfig:
-        def steps(name: str, value: int) -> int:
-            return value if name in keep else round(value * config.iterations / PAPERS_STEPS)
-
-        density = config.densify
-        density = replace(
-            density, start=steps("densify.start", density.start), stop=steps("densify.stop", density.stop)
-        )
-        return replace(config, densify=density, method=replace(self, warm_up=steps("warm_up", self.warm_up)))
+        warm_up = round(self.warm_up * config.iterations / PAPERS_STEPS)
+        return config if "warm_up" in keep else replace(config, method=replace(self, warm_up=warm_up))
 
 
 class RhoAccuracy(TraceSettings):
@@ -125,12 +148,17 @@ class StableGSMethod(Method[StableGS]):
     """Training with StableGS.
 
     magnitudes: of the probed attributes, by name.  normals: (x, y) in pixels of each training view's edge, 0 where it has none.
+    coupling: of the sampled parts of traces, `coupling_ratios`.  pair: seeds of the probe whose opposite comes next, and the
+    number of parameters that it was drawn for.
     """
 
     def __init__(self, settings: StableGS, seed: int):
         super().__init__(settings, seed)
         self.magnitudes: dict[str, Magnitude] = {}
         self.normals: list[Tensor] = []
+        self.coupling: dict[str, tuple[float, float]] = {}
+        self.pair: tuple[list[int], int] | None = None
+        self._drawn: dict[str, Tensor] | None = None  # of the pair; drawn again from its seeds after a resume
 
     def on_start(self, training: Training, views: Sequence[View]) -> None:
         if self.settings.vsp_weight:
@@ -147,58 +175,82 @@ class StableGSMethod(Method[StableGS]):
         if since < 0 or (settings.asp_weight == settings.vsp_weight == 0):
             return base
         if since % settings.every == 0:
-            self._diagnose(step)
-        probed = probe_attributes(
-            step.gaussians, base.gradient, step.camera, base.splats, self.magnitudes, settings.probe, self.generator
-        )
-        poses = self._poses(step)
+            self._diagnose(step, sampled=since // settings.every % settings.sampled_every == 0)
         # without magnitudes the probed copy equals the original: same gradient, and no disagreement from any viewpoint
         if not self.magnitudes:
             return replace(base, gradient=(1 + settings.asp_weight) * base.gradient)
-        total = base.gradient.clone()
+        draws, sign = self._draws(step.gaussians)
+        probed = probe_attributes(
+            step.gaussians, base.gradient, step.camera, base.splats, self.magnitudes, settings.probe, draws, sign
+        )
+        in_base, in_probed = None, None  # gradients of both losses in Theta and in Theta'
         if settings.asp_weight:
-            of_probed = step.loss_and_gradient(probed.gaussians)
-            total.add_(probed.pull(of_probed.gradient), alpha=settings.asp_weight)
+            views = range(len(step.views)) if settings.asp_views == "all" else [step.chosen]
+            for m in views:
+                found = step.of_view(m, probed.gaussians).gradient
+                in_probed = _plus(in_probed, found, settings.asp_weight / len(views))
+        poses = self._poses(step)
         for pose in poses:
-            if found := agreement_gradients(step, (step.gaussians, probed.gaussians), pose):
-                disagreement = found[0].add_(probed.pull(found[1]))
-                total.add_(disagreement, alpha=settings.vsp_weight / len(poses))
-            else:
+            compared = agreement(step, (step.gaussians, probed.gaussians), pose)
+            if compared is None:
                 self._count_unseen(step)
-        return replace(base, gradient=total)
+                continue
+            weight = settings.vsp_weight / (settings.vsp_share * len(poses))
+            in_probed = _plus(in_probed, compared.gradient(1), weight)
+            if settings.vsp_gradient == "both":
+                in_base = _plus(in_base, compared.gradient(0), weight)
+        total = base.gradient if in_probed is None else base.gradient + probed.pull(in_probed)
+        return replace(base, gradient=total if in_base is None else total.add_(in_base))
 
-    def _diagnose(self, step: Step) -> None:
-        """Compute the magnitudes, which go to the history too, and the normals of the edges."""
+    def _draws(self, gaussians: Gaussians) -> tuple[dict[str, Tensor], float]:
+        """The numbers of `draw_steps` for this step, and their sign."""
+        pair, drawn = self.pair, self._drawn
+        self.pair = self._drawn = None
+        if pair and pair[1] == gaussians.flat.numel():
+            return drawn or draw_steps(gaussians, self.magnitudes, pair[0]), -1.0
+        seeds = draw_seeds(self.generator)
+        drawn = draw_steps(gaussians, self.magnitudes, seeds)
+        if self.settings.antithetic:
+            self.pair, self._drawn = (seeds, gaussians.flat.numel()), drawn
+        return drawn, 1.0
+
+    def _diagnose(self, step: Step, *, sampled: bool) -> None:
+        """Compute the magnitudes, which go to the history too, and the normals of the edges.  sampled: see `traces`."""
         settings = self.settings
         try:
             objective = step.config.objective(step.gaussians, step.views)
         except NothingInSight:
             self.history.append({"step": step.number, "note": "no Gaussian in sight: magnitudes kept"})
             return
-        estimates = self.traces(objective)
+        estimates = self.traces(objective, sampled=sampled)
         values, active = {name: estimate.value for name, estimate in estimates.items()}, len(objective.active)
         degree, extent = step.gaussians.sh_degree, step.training.extent
         self.magnitudes = magnitudes(values, active, degree, extent, settings.probe)
         for name, magnitude in self.magnitudes.items():
             row = {"step": step.number, "attribute": name, **asdict(magnitude)}
-            row["standard_error"] = estimates[name].standard_error
+            row |= {"standard_error": estimates[name].standard_error, "samples": estimates[name].probes}
             self.history.append(row | {"capped": magnitude.capped, "negative": magnitude.negative})
         if settings.vsp_weight and settings.viewpoint.edge_rotation:
             with torch.no_grad():
                 depths = (render_depth(step.gaussians, view.camera, step.config.render) for view in step.views)
                 self.normals = [dominant_edge(depth, alpha)[0] for depth, alpha in depths]
 
-    def traces(self, objective: SceneObjective) -> dict[str, TraceEstimate]:
-        """Traces of the Hessian's blocks of the probed attributes."""
+    def traces(self, objective: SceneObjective, *, sampled: bool = True) -> dict[str, TraceEstimate]:
+        """Traces of the Hessian's blocks of the probed attributes.  sampled: also what can be had from an earlier diagnosis."""
         settings, names = self.settings, self.settings.probe.on
         if not names:
             return {}
         if settings.traces == "paper":
             return estimate_traces(SceneHessian(objective), self.generator, PAPER, names)
+        if not sampled and self.coupling.keys() >= set(names):
+            return carried_traces(objective, self.coupling)
         if settings.accuracy == inf:
-            return exact_traces(objective, self.generator, names=names, samples=LEAST_SAMPLES)
-        enough = RhoAccuracy(rtol=2 * settings.accuracy, max_probes=MOST_SAMPLES)
-        return exact_traces(objective, self.generator, enough, names=names)
+            found = exact_traces(objective, self.generator, names=names, samples=LEAST_SAMPLES)
+        else:
+            enough = RhoAccuracy(rtol=2 * settings.accuracy, max_probes=MOST_SAMPLES)
+            found = exact_traces(objective, self.generator, enough, names=names)
+        self.coupling = coupling_ratios(objective, found)
+        return found
 
     def _count_unseen(self, step: Step) -> None:
         """Count a probed viewpoint that sees nothing, in a row of the history after the last diagnosis."""
@@ -209,11 +261,10 @@ class StableGSMethod(Method[StableGS]):
 
     def _poses(self, step: Step) -> list[Camera]:
         """The viewpoints of this step."""
-        settings = self.settings
-        if not settings.vsp_weight:
+        settings, cameras = self.settings, [view.camera for view in step.views]
+        if not settings.vsp_weight or (settings.vsp_share < 1 and self._random() >= settings.vsp_share):
             return []
-        cameras = [view.camera for view in step.views]
-        which = range(len(cameras)) if settings.viewpoints == "all" else [step.chosen]
+        which = range(len(cameras)) if settings.viewpoints == "all" else [int(self._random() * len(cameras))]
         return [
             composite_pose(
                 cameras, m, self.normals[m] if self.normals else torch.zeros(2), self.geometry, settings.viewpoint,
@@ -222,13 +273,27 @@ class StableGSMethod(Method[StableGS]):
             for m in which
         ]  # fmt: skip
 
+    def _random(self) -> float:
+        """Uniform in [0, 1)."""
+        return float(torch.rand((), generator=self.generator, dtype=torch.float64))
+
     def state(self) -> dict[str, Any]:
         magnitudes = {name: asdict(magnitude) for name, magnitude in self.magnitudes.items()}
-        return {**super().state(), "magnitudes": magnitudes, "normals": self.normals}
+        own = {"magnitudes": magnitudes, "normals": self.normals, "coupling": self.coupling, "pair": self.pair}
+        return {**super().state(), **own}
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
         self.magnitudes = typed(dict[Attribute, Magnitude], state["magnitudes"], "magnitudes")
         self.normals = typed(list[Tensor], state["normals"], "normals")
+        self.coupling = typed(dict[Attribute, tuple[Ratio, NonNegative]], state["coupling"], "coupling")
+        self.pair = typed(tuple[list[Count], Count] | None, state["pair"], "pair")
+        if self.pair and len(self.pair[0]) != len(DRAWN):
+            raise InputError(f"'pair': expected {len(DRAWN)} seeds, got {len(self.pair[0])}")
         if not all(normal.shape == (2,) for normal in self.normals):
             raise InputError("'normals': expected vectors of two numbers")
+
+
+def _plus(total: Float[Tensor, " p"] | None, gradient: Float[Tensor, " p"], weight: float) -> Float[Tensor, " p"]:
+    """total + weight gradient, in place of one of them."""
+    return gradient.mul_(weight) if total is None else total.add_(gradient, alpha=weight)

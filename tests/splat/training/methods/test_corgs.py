@@ -44,7 +44,7 @@ def a_step(settings: CoRGS, number: int) -> tuple[Step, Training]:
     partner.gaussians = tiny_gaussians(sh_degree=1, seed=3, dtype=torch.float64)
     loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
     background = torch.tensor(config.background, dtype=torch.float64)
-    return Step(number, training, training.gaussians, views, 1, background, loss), partner
+    return Step(number, training, training.gaussians, views, 1, background, lambda _: loss), partner
 
 
 def test_with_neither_term_the_first_field_is_that_of_3dgs():
@@ -90,7 +90,7 @@ def test_each_field_descends_its_loss_and_its_disagreement_with_the_other(monkey
     monkeypatch.setattr(corgs, "pseudo_view", lambda *a: poses.append(posing(*a)) or poses[-1])
     step, partner = a_step(CoRGS(pseudo_start=5, weight=0.7), number)
     monkeypatch.setattr(partner, "descend", lambda gradient, at: descended.append((gradient, at)))
-    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss_of(step.chosen), step.background)
     own = step.training.method.gradient(step, base).gradient
     assert len(poses) == (weight > 0) and [at for _, at in descended] == [number]
 

@@ -24,7 +24,7 @@ from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tin
 
 SHORT: dict[str, MethodSettings] = {
     "3dgs": ThreeDGS(),
-    "stablegs": StableGS(warm_up=3, every=4),
+    "stablegs": StableGS(warm_up=3, every=2, sampled_every=2, vsp_share=0.5),
     "sam": SAM(),
     "dropgaussian": DropGaussian(),
     "dropoutgs": DropoutGS(),
@@ -105,6 +105,8 @@ NO_WHOLE_NUMBERS = ["many", -1, 2.5, None, 10**400, torch.zeros(3)]
         ("newton-blocks", ("damping",), ["much", -1.0, 0.0, None, float("nan")], "'damping'"),
         ("newton-blocks", ("last",), [3, [2.0], torch.zeros(2, 2), torch.full((3,), float("nan"))], "'last'"),
         ("stablegs", ("normals",), [{}, 3, [2], [torch.zeros(3)]], "'normals.* expected"),
+        ("stablegs", ("coupling", "sh"), [3, (1.0,), (float("nan"), 1.0), (1.0, -1.0), ("much", 1.0)], "'coupling"),
+        ("stablegs", ("pair",), [3, ([1, 2], 5), ([1, 2, -3], 5), ([1, 2, 3], -5), ([1, 2, 2.5], 5)], "'pair"),
     ],
 )
 def test_what_no_method_can_have_saved_is_refused_in_a_sentence(tmp_path, saved, name, place, values, words):
@@ -133,6 +135,24 @@ def test_normals_of_other_views_are_refused_before_the_first_step(tmp_path, save
     training.method.restore(training.method.state() | {"normals": [torch.zeros(2)]})
     with pytest.raises(ValueError, match="normal for each of 3 training views, found 1"):
         next(train(training, views()))
+
+
+@pytest.mark.parametrize(
+    "off",
+    [
+        StableGS(warm_up=3, asp_weight=0.0, vsp_weight=0.0),
+        CoRGS(prune_every=0, weight=0.0),
+        FSGS(unpool_until=0, depth_weight=0.0),
+    ],
+)
+def test_a_method_of_which_all_is_switched_off_is_3dgs_bit_for_bit(off):
+    ends = []
+    for method in (ThreeDGS(), off):
+        training = Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=method))
+        assert len([*train(training, views())]) == 12
+        ends.append(training)
+    assert torch.equal(ends[0].gaussians.flat, ends[1].gaussians.flat)
+    assert torch.equal(ends[0].adam.second.flat, ends[1].adam.second.flat)
 
 
 @pytest.mark.parametrize("name", [name for name in METHODS if name != "3dgs"])

@@ -27,12 +27,12 @@ def a_step(settings: DNGaussian, number: int = 1, scale: float = 1.0, shift: flo
     config = TrainConfig(10, method=settings)
     training = Training.start(tiny_gaussians(sh_degree=1, dtype=torch.float64), EXTENT, config)
     loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
-    return Step(number, training, training.gaussians, views, 1, torch.zeros(3, dtype=torch.float64), loss)
+    return Step(number, training, training.gaussians, views, 1, torch.zeros(3, dtype=torch.float64), lambda _: loss)
 
 
 def added(step: Step) -> Gaussians:
     """What the method adds to the photometric gradient."""
-    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss_of(step.chosen), step.background)
     return step.gaussians.with_flat(step.training.method.gradient(step, base).gradient - base.gradient)
 
 

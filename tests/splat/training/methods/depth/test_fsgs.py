@@ -29,7 +29,7 @@ def a_step(settings: FSGS, number: int = 1) -> Step:
     views, config = with_depths(tiny_views(torch.float64)), TrainConfig(10, method=settings)
     training = Training.start(tiny_gaussians(sh_degree=1, dtype=torch.float64), EXTENT, config)
     loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
-    return Step(number, training, training.gaussians, views, 1, torch.zeros(3, dtype=torch.float64), loss)
+    return Step(number, training, training.gaussians, views, 1, torch.zeros(3, dtype=torch.float64), lambda _: loss)
 
 
 def edges_by_hand(means: np.ndarray, largest: np.ndarray, settings: FSGS) -> list[tuple[int, int]]:
@@ -125,7 +125,7 @@ def test_disparities_down_to_minus_200_are_correlated_as_they_are():
 def test_the_gradient_is_that_of_the_loss_and_the_weighted_depth_term(number, weight):
     settings = FSGS(depth_weight=0.3, late_depth_weight=0.02, depth_until=6, depths="depth")
     step = a_step(settings, number)
-    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss_of(step.chosen), step.background)
     got = step.training.method.gradient(step, base).gradient
 
     flat = step.gaussians.flat.detach().requires_grad_()
@@ -140,7 +140,7 @@ def test_where_nothing_is_seen_depth_adds_nothing_and_is_not_correlated(monkeypa
     monkeypatch.setattr(fsgs, "depth_loss", None)
     step = a_step(FSGS())
     step.gaussians.means[:, 2] = -3.0
-    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss_of(step.chosen), step.background)
     assert torch.equal(step.training.method.gradient(step, base).gradient, base.gradient)
 
 

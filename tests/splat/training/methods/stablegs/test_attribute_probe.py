@@ -20,6 +20,8 @@ from splat.training.methods.stablegs.attribute_probe import (
     Magnitude,
     Probed,
     ProbeSettings,
+    draw_seeds,
+    draw_steps,
     exponential,
     hamilton,
     magnitudes,
@@ -62,9 +64,10 @@ def probe(
     rho: Mapping[str, float] = RHO,
     settings: ProbeSettings = DEFAULTS,
     seed: int = 0,
+    sign: float = 1.0,
 ) -> Probed:
-    splats = project(gaussians, CAMERA)
-    return probe_attributes(gaussians, gradient, CAMERA, splats, magnitudes_of(rho), settings, generator(seed))
+    splats, draws = project(gaussians, CAMERA), draw_steps(gaussians, rho, draw_seeds(generator(seed)))
+    return probe_attributes(gaussians, gradient, CAMERA, splats, magnitudes_of(rho), settings, draws, sign)
 
 
 def step_of(probed: Probed, gaussians: Gaussians) -> Gaussians:
@@ -280,22 +283,48 @@ def test_an_axis_alone_is_probed_as_among_all_and_leaves_the_others(name):
     assert not torch.equal(alone.attributes[name], gaussians.attributes[name])
 
 
-def test_the_generator_goes_on_alike_whatever_is_probed():
+def test_the_same_seed_gives_the_same_probe_and_another_one_another():
     gaussians, gradient = scene()
-    assert torch.equal(
-        step_of(probe(gaussians, gradient, seed=1), gaussians).flat,
-        step_of(probe(gaussians, gradient, seed=1), gaussians).flat,
+    one, again, other = (step_of(probe(gaussians, gradient, seed=seed), gaussians) for seed in (1, 1, 2))
+    assert torch.equal(one.flat, again.flat) and not torch.equal(one.sh, other.sh)
+
+
+def test_the_opposite_probe_steps_back_along_every_random_direction_and_on_along_the_gradient():
+    gaussians, gradient = scene()
+    there, back = (step_of(probe(gaussians, gradient, sign=sign), gaussians).attributes for sign in (1.0, -1.0))
+    for name in ("log_scales", "sh"):
+        assert torch.allclose(back[name], -there[name], rtol=0, atol=10 * ROUND_OFF) and there[name].any()
+    for name in ("means", "opacity_logits"):
+        assert torch.equal(back[name], there[name])
+    turns, returns = (probe(gaussians, gradient, sign=sign).turns for sign in (1.0, -1.0))
+    assert torch.equal(returns, turns * torch.tensor([1, -1, -1, -1])) and turns[:, 1:].any()
+
+
+def test_a_quaternion_unit_is_two_radians():
+    radian, quaternion = (
+        magnitudes(TRACES, 6, 1, EXTENT, ProbeSettings(caps=UNCAPPED, rotation_unit=unit))
+        for unit in ("radian", "quaternion")
     )
-    assert not torch.equal(
-        step_of(probe(gaussians, gradient, seed=1), gaussians).sh,
-        step_of(probe(gaussians, gradient, seed=2), gaussians).sh,
-    )
-    after = []
-    for chosen in ({}, magnitudes_of(RHO)):
-        source = generator()
-        probe_attributes(gaussians, gradient, CAMERA, project(gaussians, CAMERA), chosen, ProbeSettings(), source)
-        after.append(torch.rand(1, generator=source))
-    assert torch.equal(*after)
+    assert quaternion.pop("quats").rho == 2 * radian.pop("quats").rho and quaternion == radian
+
+
+@pytest.mark.parametrize("unit", ["radian", "quaternion"])
+def test_an_equal_dose_is_an_equal_rise_of_a_quadratic_loss(unit):
+    """z H z / 2 over random steps of rho, with any H of the trace; a turn by omega moves a unit quaternion by omega / 2."""
+    settings = ProbeSettings(caps=UNCAPPED, eps=1e-30, rotation_unit=unit, c=Constants(0.01, 0.02, 0.03, 0.04, 0.05))
+    dims = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 12}
+    own, equal = (magnitudes(TRACES, 6, 1, EXTENT, replace(settings, dose=dose)) for dose in ("constants", "equal"))
+    rises = {}
+    for dose, found in (("own", own), ("equal", equal)):
+        lengths = {name: found[name].rho / (2 if name == "quats" else 1) for name in found}
+        rises[dose] = np.array([lengths[name] ** 2 * TRACES[name] / 2 for name in lengths])
+    assert np.allclose(rises["equal"], rises["own"].mean(), rtol=1e-12)
+    turn = 1 if unit == "quaternion" else 0.5
+    c = {"means": 0.01, "log_scales": 0.02, "quats": 0.03 * turn, "opacity_logits": 0.04, "sh": 0.05}
+    assert np.allclose(rises["own"], [c[name] ** 2 * dims[name] / 2 for name in c], rtol=1e-12)
+    two = ProbeSettings(caps=UNCAPPED, attributes=("means", "log_scales"), dose="equal")
+    alike = magnitudes(TRACES, 6, 1, EXTENT, two)
+    assert alike["means"].rho == pytest.approx(0.01 / (alike["means"].tau + 1e-6), rel=1e-12)  # equal already
 
 
 def test_the_gradient_is_pulled_back_as_autograd_does():
@@ -315,8 +344,9 @@ def test_the_step_is_a_constant():
     flat = gaussians.flat.clone().requires_grad_()
     alive = gaussians.with_flat(flat)
     moved = probe_attributes(
-        alive, gradient, CAMERA, project(alive, CAMERA), magnitudes_of(RHO), ProbeSettings(), generator()
-    )
+        alive, gradient, CAMERA, project(alive, CAMERA), magnitudes_of(RHO), DEFAULTS,
+        draw_steps(alive, RHO, draw_seeds(generator())),
+    )  # fmt: skip
     assert not moved.gaussians.flat.requires_grad and not moved.turns.requires_grad
 
 
