@@ -5,8 +5,8 @@ returns a frozen result that carries its error.  Bad arguments, and products tha
 `InputError`, a ValueError; arrays of a wrong shape or type a plain one.
 
     operators     `ObjectiveHessian` of a torch function, `DenseOperator` of a matrix, and sums, restrictions, ... of these
-    renderers     `RendererHessian` of any renderer with a gradient, differentiable only once; `gauss_newton_traces`, ... by its
-                  backward passes alone
+    renderers     `RendererHessian` of any renderer with a gradient, differentiable only once, and `check_renderer`;
+                  `gauss_newton_traces`, ... by its backward passes alone; `renderer_eigenpairs`; `Monitor` of a training
     checks        `check_operator`, `check_gradient`, `check_objective`: is it the Hessian?
     estimators    `estimate_traces`, `estimate_diagonal`, `extreme_eigenpairs`, `spectral_density`
     indices       `anisotropy` of ends and a density; `families`: of the whole operator and of each of its blocks

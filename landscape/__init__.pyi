@@ -1,4 +1,5 @@
 # The public names, for type checkers and for `__init__.py`, which imports a module when its first name is used.
+from .eigen.approximate import renderer_eigenpairs as renderer_eigenpairs
 from .eigen.eigen import EigenSettings as EigenSettings
 from .eigen.eigen import extreme_eigenpairs as extreme_eigenpairs
 from .eigen.lanczos import LanczosFactorization as LanczosFactorization
@@ -24,6 +25,8 @@ from .operators.operator import RestrictedOperator as RestrictedOperator
 from .operators.operator import ScaledOperator as ScaledOperator
 from .operators.operator import SumOperator as SumOperator
 from .operators.operator import SymmetricOperator as SymmetricOperator
+from .operators.renderer.check import RendererCheck as RendererCheck
+from .operators.renderer.check import check_renderer as check_renderer
 from .operators.renderer.renderer import ProductErrors as ProductErrors
 from .operators.renderer.renderer import RendererHessian as RendererHessian
 from .results import Bracket as Bracket
@@ -55,6 +58,7 @@ from .spectrum.families import FamilySettings as FamilySettings
 from .spectrum.families import Lead as Lead
 from .spectrum.families import families as families
 from .spectrum.families import family as family
+from .spectrum.monitor import Monitor as Monitor
 from .spectrum.rules import SpectralDensity as SpectralDensity
 from .traces.diagonal import DiagonalEstimate as DiagonalEstimate
 from .traces.diagonal import GroupSums as GroupSums

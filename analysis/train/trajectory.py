@@ -41,7 +41,6 @@ import pandas as pd
 import torch
 
 from analysis.records.run_files import NO_TIME, RECORDS, read_trajectory
-from analysis.records.schema import INDICES
 from landscape import (
     CountingOperator,
     EigenSettings,
@@ -56,13 +55,13 @@ from landscape.errors import InputError
 from landscape.probes import spawn
 from landscape.spectrum.anisotropy import Anisotropy
 from landscape.spectrum.density import ActiveSpace
+from landscape.spectrum.monitor import COLUMNS as MEASURED
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import total_trace
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, block_traces, exact_traces
-from splat.model.gaussians import ATTRIBUTES
 from splat.scenes.view import View
 from splat.training.checkpoint import Checkpoint, write_atomically
 from splat.training.origin.scene_reference import SceneReference
@@ -75,13 +74,7 @@ FEWEST_OF_DENSITY = 16  # products
 COARSE_MATVECS = 24  # products of a coarse record's search for the ends
 # cost of a record, in gradients of all views
 TYPICAL = {"coarse": 20.0, "whole": 64.0}
-COLUMNS = (
-    "step", "gaussians", "state", "note", "seconds", "time_share", "visible_gaussians", "parameters", "matvecs",
-    *(f"trace_{name}{key}" for name in ATTRIBUTES for key in ("", "_error", "_low", "_high", "_dim", "_reason")),
-    *(f"lambda_{end}{key}" for end in ("max", "min") for key in ("", "_error", "_reason")),
-    *(f"{index}{key}" for index in INDICES for key in ("", "_low", "_high")),
-    *(f"of_{part}" for part in ("data", "question", "state", "formulas")),
-)  # fmt: skip
+COLUMNS = (*MEASURED, *(f"of_{part}" for part in ("data", "question", "state", "formulas")))
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.operators.operator import require_blocks
 
 
 class Parameters:
     """Named leaf tensors as one vector (n,), in the order of the mapping; `blocks` names the rows of each.
 
+    Neighbours whose names agree before a slash, as sh/dc and sh/rest, are one block.
     InputError unless all are leaves of one floating type and device that require a gradient, and finite.
     """
 
@@ -33,7 +35,12 @@ class Parameters:
             raise InputError(f"expected parameters of one type on one device, got {sorted(map(str, kinds))}")
         self.tensors = list(named.values())
         ends = list(accumulate(tensor.numel() for tensor in self.tensors))
-        self.blocks = {name: slice(end - t.numel(), end) for (name, t), end in zip(named.items(), ends, strict=True)}
+        self.rows = [slice(end - tensor.numel(), end) for tensor, end in zip(self.tensors, ends, strict=True)]
+        joined: dict[str, slice] = {}
+        for name, rows in zip(named, self.rows, strict=True):
+            block = name.split("/")[0]
+            joined[block] = slice(joined.get(block, rows).start, rows.stop)
+        self.blocks = require_blocks(joined, ends[-1])
         self.dim, (self.dtype, self.device) = ends[-1], kinds.pop()
 
     @property
@@ -50,7 +57,7 @@ class Parameters:
 
         It writes to `data`, unseen by autograd: a graph can be used again when the numbers it was made with are back.
         """
-        for tensor, rows in zip(self.tensors, self.blocks.values(), strict=True):
+        for tensor, rows in zip(self.tensors, self.rows, strict=True):
             tensor.data.copy_(flat[rows].view_as(tensor))
 
     @contextmanager

@@ -106,7 +106,8 @@ class RendererHessian:
     """The Hessian of the mean loss over views, from a renderer that need be differentiable only once.
 
     render: from a view to its image, a tensor of any shape that depends on the parameters as they are at the call.
-    parameters: the leaf tensors by name, of one type on one device; a block for each, in this order.
+    parameters: the leaf tensors by name, of one type on one device; a block for each, in this order, and one for neighbours
+        whose names agree before a slash, as sh/dc and sh/rest.
     loss: from (image, view) to a tensor of one number, by torch operations that are differentiable twice in the image.
     views: one graph at a time is kept, whatever their number.
     noise: standard deviation of the renderer's noise, relative to the size of the image; what two renders of the first view
@@ -225,7 +226,7 @@ class RendererHessian:
                 view = self.linear(index)
                 still = self.parameters.vjp(view.image, view.gradient.detach(), keep=True) if self.curved else here
                 for j, v in enumerate(V.unbind(dim=1)):
-                    steps[j] = steps[j] or self._step(index, view, here, v)
+                    steps[j] = steps[j] or self.step(index, view, here, v)
                     if steps[j]:  # else the view does not see v
                         Hv, Jv, apart = self._product(index, view, still, here, v, factor * steps[j])
                         total[:, j] += Hv
@@ -234,7 +235,7 @@ class RendererHessian:
         lengths = factor * torch.tensor(steps, dtype=torch.float64)
         return total / len(self.views), kinks[0] / kinks[1].clamp_min(1e-300), lengths
 
-    def _step(self, index: int, view: LinearView, here: Tensor, v: Tensor) -> float:
+    def step(self, index: int, view: LinearView, here: Tensor, v: Tensor) -> float:
         """The step h along v; 0 where it does not change the image."""
         largest, target = float(v.abs().max()), self.change * (rms(view.image) or 1.0)
         h = self.change * (float(here.abs().max()) or 1.0) / largest if largest else 0.0
@@ -245,16 +246,28 @@ class RendererHessian:
         self.parameters.write(here)
         return h
 
+    def change_of_image(
+        self, index: int, view: LinearView, here: Tensor, v: Tensor, h: float
+    ) -> tuple[Tensor, Bool[Tensor, "..."]]:
+        """J v of one view, for two renders, and where its one-sided differences disagree."""
+        images = []
+        for step in (h, -h):
+            self.parameters.write(here.double() + step * v.double())
+            images.append(self.image(index, view.image))
+        self.parameters.write(here)
+        middle = view.image.detach()
+        return one_sided((images[0] - middle) / h, (middle - images[1]) / h)
+
     def _product(
         self, index: int, view: LinearView, still: Tensor, here: Tensor, v: Tensor, h: float
     ) -> tuple[Tensor, Tensor, Bool[Tensor, "..."]]:
         """H_m v of one view, J v, and where its one-sided differences disagree.  still: J^T g."""
+        if not self.curved:
+            Jv, apart = self.change_of_image(index, view, here, v, h)
+            return self.parameters.vjp(view.image, view.curvature(Jv), keep=True), Jv, apart
         images, pulled = [], []
         for step in (h, -h):
             self.parameters.write(here.double() + step * v.double())
-            if not self.curved:
-                images.append(self.image(index, view.image))
-                continue
             with torch.enable_grad():
                 image = self.render(self.views[index])
             images.append(_alike(image, view.image, index))
@@ -262,10 +275,8 @@ class RendererHessian:
         self.parameters.write(here)
         middle = view.image.detach()
         Jv, apart = one_sided((images[0] - middle) / h, (middle - images[1]) / h)
-        Hv = self.parameters.vjp(view.image, view.curvature(Jv), keep=True)
-        if self.curved:
-            Hv = Hv + one_sided((pulled[0] - still) / h, (still - pulled[1]) / h)[0]
-        return Hv, Jv, apart
+        turning = one_sided((pulled[0] - still) / h, (still - pulled[1]) / h)[0]
+        return self.parameters.vjp(view.image, view.curvature(Jv), keep=True) + turning, Jv, apart
 
 
 def _require_image(image: object, index: int) -> None:
