@@ -91,7 +91,9 @@ def check_renderer(hessian: RendererHessian, generator: torch.Generator) -> Rend
     stated, length = hessian.error(V[:, :1]), torch.linalg.vector_norm(hessian.apply(V[:, :1]).double())
     once, again = (gradient_ratios(hessian, V[:, 1:], factor) for factor in (1.0, 2.0))
     ratios = {
-        name: (a - 1, abs(a - b)) for name, a, b in zip(hessian.blocks, once, again, strict=True) if a is not None
+        name: (a - 1, abs(a - b))
+        for name, a, b in zip(hessian.blocks, once, again, strict=True)
+        if a is not None and b is not None
     }
     return RendererCheck(
         hessian.deterministic,
