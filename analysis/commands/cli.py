@@ -230,6 +230,9 @@ def at_files(options: Any) -> Any:
 
 def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand; returns the exit code."""
+    from analysis.records.provenance import require_seed  # not for --help
+
+    require_seed(getattr(options, "seed", 0))
     _require_compiler()
     name, function = command.runs.split(":")
     with ExitStack() as around:

@@ -28,6 +28,7 @@ from splat.render.render import render_depth
 from splat.scenes.scene import Scene
 from splat.scenes.splits import split_scene
 from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
+from splat.training.origin.frames import shift_in_words, shift_of
 from splat.training.origin.presets import PRESETS, render_of
 from splat.training.origin.scene_reference import SceneReference
 
@@ -157,7 +158,9 @@ def _foreign(options: ConvertOptions) -> tuple[SplatFile, Seen | None]:
 def own_file(checkpoint: Checkpoint) -> tuple[SplatFile, Seen]:
     """A checkpoint of ours as a file of splats, with the tool whose conventions are those it was trained with, if any."""
     training, scene = checkpoint.training, checkpoint.scene
-    seen = Seen(training.config.render, scene.centred, scene.similarity is not None)
+    shift = shift_of(scene.similarity)
+    seen = Seen(training.config.render, scene.centred, scene.similarity is not None and shift is None)
     antialiased = seen.render.antialias != "none"
     tool = next((name for name in OURS if seen.is_that_of(name, antialiased=antialiased)), None)
-    return SplatFile(training.gaussians, OURS[0], tool, training.step, antialiased=antialiased), seen
+    notes = () if shift is None else (shift_in_words(shift),)
+    return SplatFile(training.gaussians, OURS[0], tool, training.step, antialiased=antialiased, notes=notes), seen

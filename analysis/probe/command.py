@@ -108,7 +108,7 @@ def _run(
         data.steps = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
         if families is not None:
             data = _with_families(data, arrays, families, objective, checkpoint, generator, stages, found.ends)
-        data.notes += checkpoint.assumptions
+        data.notes += [*scene.notes, *checkpoint.assumptions]
         if folder is not None:
             _write(folder, data, arrays, objective, stages, start, drawn)
     if writes:

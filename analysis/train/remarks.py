@@ -24,9 +24,9 @@ HOW_IT_STARTS: dict[Source, str] = {
 HOW_TO_START: dict[Source, str] = {
     "box": "the published training does so; --start scene begins at the scene's own points",
     "random": "`landscape sfm PHOTOS` makes a scene with points, and --start triangulated finds some in the training views",
-    "triangulated": "take more --views or larger images, or --start random",
+    "triangulated": "--start dense finds more, and so do more --views",
     "dense": "take more --views or larger images, or --start random",
-    "points": "take more --views, or --start triangulated or random",
+    "points": "--start dense finds more, and so do more --views",
 }
 
 
@@ -40,7 +40,7 @@ def remarks(
 ) -> list[str]:
     """asked, config: the settings, not scaled and scaled, without what a checkpoint brings; begun: the start and its Gaussians,
     None where there is a checkpoint; view: one of those to train on."""
-    found = [_skipped(scene), begun and poor_start(scene, *begun), _scaled(asked, config), _not_reached(config)]
+    found = [*scene.notes, begun and poor_start(scene, *begun), _scaled(asked, config), _not_reached(config)]
     found += [*_of_second_order(config), removes_for_size(training, view)]
     return [words for words in found if words]
 
@@ -89,7 +89,7 @@ def poor_start(scene: Scene, source: Source, gaussians: int) -> str:
     >>> from splat import SyntheticSettings, synthetic_scene
     >>> scene = synthetic_scene(SyntheticSettings(gaussians=50, views=3, width=16, height=12)).scene
     >>> poor_start(scene, "triangulated", 41)
-    'it starts from 41 points only, and may leave places empty; take more --views or larger images, or --start random'
+    'it starts from 41 points only, and may leave places empty; --start dense finds more, and so do more --views'
     """
     kind = _kind(scene, source)
     if kind in ("random", "box"):
@@ -101,15 +101,6 @@ def poor_start(scene: Scene, source: Source, gaussians: int) -> str:
 def _kind(scene: Scene, source: Source) -> Source:
     """Source that "scene" stands for."""
     return source if source != "scene" else "random" if scene.points is None else "points"
-
-
-def _skipped(scene: Scene) -> str:
-    """Note on the number of frames without an image; empty if there is none."""
-    count, listed = len(scene.skipped), len(scene.skipped) + len(scene.frames)
-    if not count:
-        return ""
-    words = "frames that the scene lists were skipped, because their images are missing; the first is"
-    return f"{count} of {listed} {words} {scene.skipped[0]} (--strict-frames refuses such a scene)"
 
 
 def _scaled(asked: TrainConfig, config: TrainConfig) -> str:

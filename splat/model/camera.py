@@ -15,6 +15,8 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.results import Brief
 
+ROUND_OFF = 1e-4  # of a rotation in a file, |R R^T - 1|
+
 
 @dataclass(frozen=True, repr=False)
 class Camera(Brief):
@@ -36,11 +38,8 @@ class Camera(Brief):
     height: int
 
     def __post_init__(self) -> None:
-        error = (self.rotation @ self.rotation.T - torch.eye(3, dtype=self.rotation.dtype)).abs().max().item()
-        if not error < 1e-4 or torch.linalg.det(self.rotation) < 0:
-            raise InputError(
-                f"expected a rotation matrix, got one with |R R^T - 1| = {error:.1e}: {self.rotation.tolist()}"
-            )
+        if fault := _fault_of_rotation(self.rotation):
+            raise InputError(f"expected a rotation matrix, got one that {fault}: {self.rotation.tolist()}")
         if not (self.fx > 0 and self.fy > 0 and self.width > 0 and self.height > 0):
             raise InputError(
                 f"expected positive focal lengths and image size, got {self.fx}, {self.fy}, {self.width}, {self.height}"
@@ -60,6 +59,18 @@ class Camera(Brief):
     def forward(self) -> Float[Tensor, "3"]:
         """The viewing direction (unit, world frame): R^T e_z."""
         return self.rotation[2]
+
+
+def _fault_of_rotation(matrix: Float[Tensor, "3 3"]) -> str:
+    """What keeps a matrix from being a rotation; empty where it is one."""
+    square = matrix @ matrix.T
+    apart = [
+        float((square / scale - torch.eye(3, dtype=matrix.dtype)).abs().max()) for scale in (1, square.trace() / 3)
+    ]
+    if not apart[0] < ROUND_OFF:
+        scaled = f"scales by {float(square.trace() / 3) ** 0.5:.6g}, " if apart[1] < ROUND_OFF else ""
+        return f"{scaled}has |R R^T - 1| = {apart[0]:.1e}"
+    return "mirrors: its axes are left-handed" if torch.linalg.det(matrix) < 0 else ""
 
 
 def look_at(centre: Float[Tensor, "3"], target: Float[Tensor, "3"], down: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

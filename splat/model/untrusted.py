@@ -32,6 +32,7 @@ from PIL import Image
 from landscape.errors import InputError
 
 EXPANSION = 32  # times its size on disk that an archive may hold; what this program writes is not compressed
+LFS_MAGIC = b"version https://git-lfs"
 SLACK = 2**20  # bytes that any archive may hold
 FOLDER = 0x10  # among the attributes of a member
 MOST_TEXT = 2**28  # bytes of a file of text
@@ -183,6 +184,16 @@ def require_name(name: str) -> str:
             f"expected a name of at most 100 letters, digits, - _ + . or blanks, as it names a folder, got {name!r}"
         )
     return name
+
+
+def require_content(path: Path) -> None:
+    """InputError where a file is the pointer that git lfs left in its place; nothing where there is no file."""
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(len(LFS_MAGIC)) == LFS_MAGIC:
+                raise InputError(
+                    f"expected the content of {path}, got a pointer of git lfs in its place; run `git lfs pull` in its folder"
+                )
 
 
 class Taken(InputError):

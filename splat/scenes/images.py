@@ -53,7 +53,7 @@ LARGEST_SIDE = 2**31 - 1  # px; COLMAP counts them in 32 bits
 SMALLEST = 4  # px a side of a reduced picture; a smaller one comes from a mistyped factor
 LARGEST_DISPLACEMENT = 2  # of a corner, in half diagonals; the strongest lenses stay below 1
 INSIDE = 1 - 1e-4  # share of a pixel's footprint inside the mask; below 1 by more than float32 sums can lose
-Warp = Callable[[Float[Tensor, "c h w"]], Float[Tensor, "c height width"]]
+Warp = Callable[[tuple[int, int], Float[Tensor, "c h w"]], Float[Tensor, "c height width"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +91,16 @@ def image_folder(root: Path, images: str | None = None) -> Path:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The image files of a folder, sorted by name."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    """The image files of a folder, sorted by name; not those that macOS hides beside them (._NAME)."""
+    files = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(path for path in files if not path.name.startswith("."))
+
+
+def image_named(path: Path) -> Path:
+    """The file, or the one that has another suffix of images, or any where the name has none; the path where there is none."""
+    bare = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+    others = (bare.with_name(bare.name + case(suffix)) for suffix in IMAGE_SUFFIXES for case in (str, str.upper))
+    return next((each for each in (path, *others) if each.is_file()), path)
 
 
 def require_files(paths: Sequence[Path], advice: str = "or name another folder of images with --images") -> None:
@@ -177,14 +185,13 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
         full = Camera(photo.rotation, photo.centre, fx, fy, cx, cy, pinhole.width, pinhole.height)
     except InputError as error:
         raise InputError(f"the camera of image {photo.name!r} cannot be: {error}") from error
-    camera = full.resized(width, height)
-    warp = partial(_warp, lens, pinhole, (width, height))
-    view = partial(_view, photo, turned, camera, warp, background)
+    picture = partial(_view, photo, turned, partial(_warp, lens, pinhole), background)
     layers = {"alpha": transparent, "mask": photo.mask, "depth": photo.depth}
     named = frozenset(name for name, there in layers.items() if there)
     distortion = "" if pinhole is lens else f"{lens.model_name} {', '.join(f'{value:.12g}' for value in lens.params)}"
     files = photo.path, named, distortion, photo.mask, photo.depth
-    return Frame(photo.name, camera, view, photo.subset, photo.depth_range, *files)
+    camera, whole = full.resized(width, height), (pinhole.width, pinhole.height)
+    return Frame(photo.name, camera, picture, photo.subset, photo.depth_range, *files, whole)
 
 
 def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> pycolmap.Camera:
@@ -242,8 +249,9 @@ def _displacement(lens: pycolmap.Camera) -> float:
     return float(np.hypot(*(np.asarray(lens.img_from_cam(rays)) - corners).T).max() / np.hypot(*size / 2))
 
 
-def _view(photo: Photo, turned: bool, camera: Camera, warp: Warp, background: Float[Tensor, "3"]) -> View:
+def _view(photo: Photo, turned: bool, warp_to: Warp, background: Float[Tensor, "3"], camera: Camera) -> View:
     """Composite over the background, undistort, downscale: in this order, no transparent colour bleeds in."""
+    warp = partial(warp_to, (camera.width, camera.height))
     layers = torch.from_numpy(image_pixels(photo.path, turned)).permute(2, 0, 1)
     size = (layers.shape[2], layers.shape[1])
     if has_alpha := len(layers) == 4:

@@ -1,6 +1,8 @@
 """Image files, and the files beside a photograph that give a number for each of its pixels: object mask, depth map.
 
-mask    an image file; a pixel is inside if every channel has the file's largest value (white; 1 in a mask of 0 and 1)
+mask    an image file, black outside and white inside: a pixel is inside if every colour has at least half of the file's largest
+        value (255, or 1 in a mask of 0 and 1).  Where the file has an alpha channel that varies, that is the mask, not the
+        colours.  Labels, colours and soft edges over large parts are refused
 depth   NAME.npy, or NAME.png of 16 bits: relative monocular depth, in any unit.  The numbers are kept as they are; whether
         larger means farther (depth) or nearer (disparity, as MiDaS and DPT give it) is for the method that uses them
 
@@ -23,7 +25,7 @@ from PIL import Image
 from torch import Tensor
 
 from landscape.errors import InputError
-from splat.model.untrusted import read_array
+from splat.model.untrusted import read_array, require_content
 from splat.scenes.view import View
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -34,6 +36,9 @@ SIXTEEN_BITS = ("I;16", "I;16B", "I")
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
 MOST_ROWS = 2**16  # more than JPEG has; Pillow keeps an address for each, which may be more than the pixels
+UNCLEAR = (0.25, 0.75)  # of the largest value: what has a colour above the one and another below the other is neither
+MOST_UNCLEAR = 0.1  # of the pixels that are not black; edges of a mask, and JPEG's noise round them, are less
+MOST_LABELS = 64  # a larger number than 1 up to here counts objects
 STRIP = 256  # rows of a mask at a time: a large one would take a GB in all its copies
 # raised by Pillow for damaged files
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
@@ -58,6 +63,7 @@ class _File(io.BufferedReader):
 def opened_image(path: Path, kind: str = "an image") -> Iterator[Image.Image]:
     """An image file, open.  InputError that says which kind was expected, where it cannot be read or is too large."""
     try:
+        require_content(path)
         with _File(path) as content, Image.open(content, formats=FORMATS) as file:
             if file.width * file.height > MOST_PIXELS or max(file.size) > MOST_ROWS:
                 raise InputError(
@@ -108,22 +114,42 @@ def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
     """1 inside, 0 outside."""
     with opened_image(path, "a mask") as file:
         file.load()
-        tops = range(0, file.height, STRIP)
-        lowest = np.concatenate([_lowest(file.crop((0, y, file.width, min(y + STRIP, file.height)))) for y in tops])
-    if not lowest.any():
+        low, high = _range_of_colours(file, alpha=file.has_transparency_data)
+        if file.has_transparency_data and low.min() == low.max():
+            low, high = _range_of_colours(file, alpha=False)
+    white = int(high.max())
+    if not white:
         raise InputError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
-    return torch.from_numpy(lowest == lowest.max()).to(torch.float32)[None]
+    between = float((low < UNCLEAR[1] * white)[(high > UNCLEAR[0] * white)].mean())
+    if between > MOST_UNCLEAR or 1 < white <= MOST_LABELS:
+        raise InputError(
+            f"expected a mask of black outside and white inside, got numbers up to {white} and {between:.0%} of what is not "
+            f"black in colours or half dark in {path}: labels, or a soft mask; write 255 for what counts and 0 for all else"
+        )
+    return torch.from_numpy(low >= white / 2).to(torch.float32)[None]
 
 
-def _lowest(image: Image.Image) -> np.ndarray:
-    """The smallest of each pixel's colour channels, (h, w)."""
-    pixels = np.array(image if image.mode in ("1", "L", "RGB", "RGBA") else image.convert("RGB"))
-    return pixels.reshape(*pixels.shape[:2], -1)[..., :3].min(axis=2)
+def _range_of_colours(file: Image.Image, *, alpha: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and the largest of each pixel's colours, or its alpha twice, (h, w) each."""
+    tops = range(0, file.height, STRIP)
+    strips = [_channels(file.crop((0, y, file.width, min(y + STRIP, file.height))), alpha) for y in tops]
+    ends = zip(*((strip.min(axis=2), strip.max(axis=2)) for strip in strips))
+    low, high = (np.concatenate(parts) for parts in ends)
+    return low, high
+
+
+def _channels(image: Image.Image, alpha: bool) -> np.ndarray:
+    """The colours, or the alpha alone, (h, w, c)."""
+    if alpha:
+        return np.array(image.convert("RGBA"))[..., 3:]
+    pixels = np.array(image if image.mode in ("L", "RGB", *SIXTEEN_BITS) else image.convert("RGB"))
+    return np.atleast_3d(pixels)
 
 
 def read_depth(path: Path) -> Float[Tensor, "1 h w"]:
     """The numbers of the file, checked."""
     if path.suffix == ".npy":
+        require_content(path)
         try:
             with path.open("rb") as stream:
                 values = read_array(stream)

@@ -25,7 +25,7 @@ from landscape.errors import InputError
 from landscape.results import Brief
 from splat.backend.memory import free_memory
 from splat.model.camera import Camera
-from splat.scenes.formats.colmap import MODEL_FOLDERS, find_model, read_colmap
+from splat.scenes.formats.colmap import MODEL_FOLDERS, find_model, part_of_model, read_colmap
 from splat.scenes.formats.dtu import is_dtu, mask_folder, read_dtu
 from splat.scenes.formats.llff import POSES, read_llff
 from splat.scenes.formats.transforms import BLENDER_FILES, SINGLE_FILE, read_blender, read_transforms
@@ -41,7 +41,7 @@ Kind = Literal["colmap", "llff", "blender", "transforms", "dtu", "synthetic"]
 class Scene(Brief):
     """Frames sorted by name (Blender: in the order of its files), points if any, and the background colour.
 
-    skipped: names of frames that the scene's file lists without an image.
+    notes: sentences on what its files say and is not used.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Scene(Brief):
     frames: tuple[Frame, ...]
     points: Points | None
     background: Float[Tensor, "3"]
-    skipped: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -153,7 +153,7 @@ def load_scene(
         background = (1.0,) * 3 if image_header(photos[0].path)[1] else (0.0,) * 3
     colour = _colour(background)
     frames = tuple(frame(photo, downscale, colour) for photo in photos)
-    return Scene(root.resolve().name, root.resolve(), found.kind, frames, found.points, colour, tuple(found.skipped))
+    return Scene(root.resolve().name, root.resolve(), found.kind, frames, found.points, colour, tuple(found.notes))
 
 
 def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
@@ -170,33 +170,41 @@ class _Found(NamedTuple):
     photos: list[Photo]
     points: Points | None = None
     background: list[float] | None = None
-    skipped: Sequence[str] = ()
+    notes: Sequence[str] = ()
 
 
 def _read(root: Path, images: str | None, points: bool, strict: bool) -> _Found:
     model = find_model(root)
     if model is not None:
-        return _Found("colmap", *read_colmap(root, model, images, points=points))
+        photos, cloud, notes = read_colmap(root, model, images, points=points)
+        return _Found("colmap", photos, cloud, notes=[*notes, *_not_read(root, model.relative_to(root).as_posix())])
     if (root / POSES).is_file():
-        return _Found("llff", read_llff(root, images))
+        return _Found("llff", read_llff(root, images), notes=_not_read(root, POSES))
     if all((root / name).is_file() for _, name in BLENDER_FILES):
         if images is not None:
             raise InputError(f"expected no image folder for {root}, whose transforms files name theirs, got {images!r}")
-        photos, skipped = read_blender(root, strict)
-        return _Found("blender", photos, skipped=skipped)
+        photos, notes = read_blender(root, strict)
+        return _Found("blender", photos, notes=[*notes, *_not_read(root, *(name for _, name in BLENDER_FILES))])
     for name in (SINGLE_FILE, BLENDER_FILES[0][1]):
         if (root / name).is_file():
-            return _Found("transforms", *read_transforms(root, root / name, images, strict))
+            photos, cloud, background, notes = read_transforms(root, root / name, images, strict)
+            return _Found("transforms", photos, cloud, background, [*notes, *_not_read(root, name)])
     if is_dtu(root):
         return _Found("dtu", read_dtu(root))
     found = sorted(path.name for path in root.iterdir())
+    instead = f"{', '.join(found[:6])}{' ...' if len(found) > 6 else ''}" if found else "an empty folder"
     raise FileNotFoundError(
-        f"expected a scene with camera poses in {root}: looked for a COLMAP model (cameras, images and points3D, .bin "
-        f"or .txt) in {', '.join(MODEL_FOLDERS)}, for {POSES}, {BLENDER_FILES[0][1]}, {SINGLE_FILE} and DTU's images "
-        "(rect_001_3_r5000.png); found "
-        f"{', '.join(found[:6]) + (' ...' if len(found) > 6 else '') if found else 'an empty folder'}; "
-        "make a scene of the photographs with landscape sfm"
+        f"expected a scene with camera poses in {root}: looked for a COLMAP model (cameras and images, .bin or .txt) in "
+        f"{', '.join(MODEL_FOLDERS)}, for {POSES}, {BLENDER_FILES[0][1]}, {SINGLE_FILE} and DTU's images "
+        f"(rect_001_3_r5000.png); found {part_of_model(root) or instead}; make a scene of the photographs with landscape sfm"
     )
+
+
+def _not_read(root: Path, *read: str) -> list[str]:
+    """A note on other files with poses in the folder."""
+    names = (POSES, SINGLE_FILE, *(f"transforms_{part}.json" for part in ("train", "val", "test")))
+    others = [name for name in names if name not in read and (root / name).is_file()]
+    return [f"the poses are those of {' and '.join(read)}; not read: {', '.join(others)}"] if others else []
 
 
 def _with_layers(root: Path, photos: list[Photo], masks: Path | None, depths: Path | None) -> list[Photo]:
@@ -222,6 +230,12 @@ def _with_layers(root: Path, photos: list[Photo], masks: Path | None, depths: Pa
 
 
 def _require_distinct(photos: Sequence[Photo], root: Path) -> None:
-    twice = sorted(name for name, count in Counter(photo.name for photo in photos).items() if count > 1)
-    if twice:
-        raise InputError(f"expected every image of {root} once, got {twice[0]!r} more than once ({len(twice)} such)")
+    """InputError where two views have one name, or one file."""
+    for of in (lambda photo: photo.name, lambda photo: str(photo.path.resolve())):
+        twice = sorted(each for each, count in Counter(map(of, photos)).items() if count > 1)
+        if twice:
+            views = ", ".join(photo.name for photo in photos if of(photo) == twice[0])
+            raise InputError(
+                f"expected every image of {root} once, got {twice[0]!r} more than once ({len(twice)} such), for the views "
+                f"{views}; give each view a file of its own"
+            )

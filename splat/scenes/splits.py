@@ -11,6 +11,7 @@ DTU        3, 6 or 9 views, the first of 25, 22, 28, 40, 44, 48, 0, 8, 13 (views
            names of its images, whether COLMAP or DTU itself gave the cameras
 Blender    training views r_26, r_86, r_2, r_55, r_75, r_93, r_16, r_73, the first n of them; every 8th test view,
            25 of 200: DietNeRF, FreeNeRF.  A folder already reduced to these images gives the same split
+named      a transforms.json that lists its training views (train_filenames): all of them, or n at equal steps
 explicit   training (and test) views by name or by number
 """
 
@@ -48,8 +49,10 @@ class Split:
 
 
 def usual_views(scene: Scene) -> int:
-    """The default number of training views: all 8 of Blender's protocol, else the fewest of the field."""
-    return len(BLENDER_TRAINING) if scene.kind == "blender" else FEWEST
+    """The default number of training views: all 8 of Blender's protocol, those that a file lists, else the fewest."""
+    if scene.kind == "blender":
+        return len(BLENDER_TRAINING)
+    return sum(frame.subset == "train" for frame in scene.frames) or FEWEST
 
 
 def split_scene(
@@ -77,6 +80,9 @@ def split_scene(
         raise InputError("expected a list of training views beside the list of test views, got none; give both")
     if scene.kind == "blender":
         return blender_split(scene.frames, views)
+    if any(frame.subset for frame in scene.frames):
+        train_names, test_names = ([f.name for f in scene.frames if f.subset == part] for part in ("train", "test"))
+        return Split(evenly_spaced(train_names, views), tuple(test_names), "named")
     if all(dtu_number(name) is not None for name in scene.names):
         return dtu_split(scene.names, views)
     return llff_split(scene.names, views)

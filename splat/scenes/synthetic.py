@@ -90,7 +90,7 @@ def synthetic_scene(settings: SyntheticSettings = SyntheticSettings()) -> Synthe
     frames = []
     for i, (camera, rendering) in enumerate(zip(cameras, renderings)):
         name = f"images/view_{i:03d}.png"
-        frames.append(Frame(name, camera, partial(View, name, camera, rendering.image.clamp(0, 1))))
+        frames.append(Frame(name, camera, partial(View, name, image=rendering.image.clamp(0, 1))))
     points = _points(truth, frames, renderings, settings, generator)
     scene = Scene("synthetic", Path("synthetic"), "synthetic", tuple(frames), points, torch.zeros(3))
     return SyntheticScene(scene, truth)

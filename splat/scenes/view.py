@@ -1,7 +1,7 @@
 """The parts of a scene: views, frames whose pictures are not read yet, and points.
 
     View    a camera with its picture, as training and evaluation use it
-    Frame   a camera whose picture is read from disk by `view()`; camera and size are already final
+    Frame   a camera whose picture is read from disk by `view()`, and larger by `whole_view()`; the camera is already final
     Shelf   as many views of frames as there is room for, the others as `Photograph`s: views that are read when they are used
     Points  coloured points of the scene, from structure from motion or a scanner, and the images that see each of them
 
@@ -64,15 +64,16 @@ class View(Brief):
 class Frame:
     """A posed picture that `view()` reads.
 
-    subset: the part that the scene's own files assign it to.  depth_range: nearest and farthest depth of the scene
-    content, world units.  None where the files do not say.  path: of the picture, None where it is not on disk.
-    layers: which of alpha, mask and depth its view has; mask, depth: the files.  distortion: model and parameters of its lens,
-    where that was no pinhole.
+    picture: reads it for a camera, at that camera's size.  subset: the part that the scene's own files assign it to.
+    depth_range: nearest and farthest depth of the scene content, world units.  None where the files do not say.  path: of the
+    picture, None where it is not on disk.  layers: which of alpha, mask and depth its view has; mask, depth: the files.
+    distortion: model and parameters of its lens, where that was no pinhole.  whole: (width, height) of the photograph, px, before
+    it is reduced; None: that of the camera.
     """
 
     name: str
     camera: Camera
-    view: Callable[[], View]
+    picture: Callable[[Camera], View]
     subset: Subset | None = None
     depth_range: tuple[float, float] | None = None
     path: Path | None = None
@@ -80,6 +81,14 @@ class Frame:
     distortion: str = ""
     mask: Path | None = None
     depth: Path | None = None
+    whole: tuple[int, int] | None = None
+
+    def view(self) -> View:
+        return self.picture(self.camera)
+
+    def whole_view(self) -> View:
+        """The view at the size of its photograph."""
+        return self.picture(self.camera.resized(*self.whole) if self.whole else self.camera)
 
     @property
     def bytes(self) -> int:

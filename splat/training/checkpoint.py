@@ -26,7 +26,7 @@ from splat.losses.reference import LossSettings
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.typed import MOST, Count, leaves, typed
-from splat.model.untrusted import loose_json, require_whole, write_atomically
+from splat.model.untrusted import loose_json, require_content, require_whole, write_atomically
 from splat.scenes.scene import Scene
 from splat.scenes.splits import spread_views
 from splat.training.adam import Adam
@@ -251,6 +251,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{KIND} at {path}, found {_instead(path)}")
+    require_content(path)
     with path.open("rb") as file:  # one file throughout: a training may replace it meanwhile
         content = _read(file, path)
     try:

@@ -31,7 +31,8 @@ from torch import Tensor
 from landscape.errors import InputError
 from splat.losses.autograd import Clamped
 from splat.losses.protocols import ViewLoss
-from splat.scenes.view import View
+from splat.projection.reference import on_screen, project
+from splat.scenes.view import View, inside_image
 from splat.training.state import Step, TrainConfig, Training
 
 
@@ -48,8 +49,8 @@ class StepResult:
 def prepare(training: Training, views: Sequence[View]) -> None:
     """Get ready for steps on these views; a second call changes nothing.
 
-    InputError where there are no views, they lack what the method needs, or no part of the method would begin.  A method of
-    which every part is switched off is 3DGS, the base that it is compared with.
+    InputError where there are no views, they lack what the method needs, none draws a Gaussian, or no part of the method would
+    begin.  A method of which every part is switched off is 3DGS, the base that it is compared with.
     """
     config = training.config
     if not views:
@@ -62,6 +63,7 @@ def prepare(training: Training, views: Sequence[View]) -> None:
             f"{config.iterations} steps ({late}); take more steps, let it begin earlier, or use the method 3dgs"
         )
     training.update_filter(0, [view.camera for view in views])
+    _require_in_sight(training, views)
     training.method.on_start(training, views)
 
 
@@ -101,6 +103,22 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
         yield StepResult(number, value, len(training.gaussians), views[chosen].name)
 
 
+@torch.no_grad()
+def _require_in_sight(training: Training, views: Sequence[View]) -> None:
+    """InputError where no view draws a Gaussian: nothing would ever move."""
+    gaussians, settings, nearer = training.gaussians, training.config.render, 0
+    gaussians = gaussians.with_flat(gaussians.flat.cpu())
+    for camera in (view.camera for view in views):
+        if bool(on_screen(project(gaussians, camera, settings), camera).any()):
+            return
+        nearer = max(nearer, int(inside_image(camera, gaussians.means.double(), (0.0, settings.near)).sum()))
+    raise InputError(
+        f"expected Gaussians that a view draws, got {len(gaussians)}, of which none of {len(views)} views draws one; up to "
+        f"{nearer} lie nearer than the near plane at {settings.near:g} world units: scale the scene, or lower it with --set "
+        "render.near=X"
+    )
+
+
 def photometric_step(step: Step) -> float:
     """A step of 3DGS on the sampled view, with what the method adds; the loss before it."""
     training, method = step.training, step.training.method
@@ -113,6 +131,11 @@ def photometric_step(step: Step) -> float:
 
     # update, then clone, split and prune
     training.descend(found.gradient, step.number)
+    if step.number == len(step.views) and not bool(training.adam.first.flat.any()):
+        raise InputError(
+            f"expected a gradient, got exactly 0 in the first {step.number} steps, one on each view: what they show does not "
+            "depend on the Gaussians; look at their opacities and at the scene's scale"
+        )
     training.control_density(step.number, step.camera, found)
     return base.loss
 

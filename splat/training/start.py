@@ -13,7 +13,8 @@ points      points: the scene's, from structure from motion, those seen by at le
                 1.3 (max - min), BOX_DENSITY of them per world unit of the longest side, grey.  The box begins at the
                 BOX_RANK-th smallest coordinate, so that it is not centred on the points
             scene: points where the scene has any, else random
-means       the points; those at one place (exactly, as triangulation leaves them) are one, of their mean colour
+means       the points, sorted, so that their order in a file is no second seed; those at one place (exactly, as triangulation
+                leaves them) are one, of their mean colour
 quats       the identity
 log_scales  isotropic: log of the root mean square distance to the three nearest neighbours (3DGS)
 opacity     0.1                                 sh      band 0 gives the point's colour, the others 0
@@ -66,12 +67,14 @@ def initial_gaussians(
     1
     """
     if source in ("points", "box") and scene.points is None:
-        raise InputError(f"expected a scene with points, {scene.root} has none; start from triangulated or random ones")
+        raise InputError(
+            f"expected a scene with points, {scene.root} has none; start from dense, triangulated or random ones"
+        )
     if source == "box":
         assert scene.points is not None
         return gaussians_from_points(points_in_box(scene.points, generator), views, sh_degree, seen_by=0)
     if source == "triangulated":
-        return gaussians_from_points(triangulated_points(views), views, sh_degree)
+        return gaussians_from_points(triangulated_points(scene.select([view.name for view in views])), views, sh_degree)
     if source in ("scene", "points") and scene.points is not None:
         return gaussians_from_points(scene.points, views, sh_degree)
     ranges = depth_ranges(views, [frame.depth_range for frame in scene.select([view.name for view in views])])
@@ -94,7 +97,7 @@ def gaussians_from_points(
     if n <= NEIGHBOURS:
         raise InputError(
             f"expected more than {NEIGHBOURS} points at different places seen by at least {needed} of the {len(views)} "
-            f"training views, got {n} of {len(points)}; choose views that overlap more, or more of them"
+            f"training views, got {n} of {len(points)}; start from dense points, or choose views that overlap more"
         )
     scales = _neighbour_distances(kept)
     sh = torch.zeros(n, (sh_degree + 1) ** 2, 3, dtype=torch.float64)
@@ -110,12 +113,15 @@ def gaussians_from_points(
 
 
 def _merged(xyz: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """The points that differ in float32, in the order of the first at each place, and the mean colours there."""
-    _, first, place = np.unique(xyz.float().numpy() + 0.0, axis=0, return_index=True, return_inverse=True)  # no -0
-    order = np.argsort(first)
-    index = torch.from_numpy(np.argsort(order)[place.ravel()])
-    sums = group_sums(rgb.double(), index, len(order))
-    return xyz[first[order]], sums / torch.bincount(index, minlength=len(order))[:, None]
+    """The points that differ in float32, sorted, and the mean colours there."""
+    order = np.lexsort(
+        [*rgb.T.numpy(), *xyz.T.numpy()]
+    )  # in which colours are summed, and one of them stands for a place
+    rounded = xyz[order].float().numpy() + 0.0  # no -0
+    _, first, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    index = torch.from_numpy(place.ravel())
+    sums = group_sums(rgb[order].double(), index, len(first))
+    return xyz[order][first], sums / torch.bincount(index, minlength=len(first))[:, None]
 
 
 def _neighbour_distances(xyz: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

@@ -337,6 +337,7 @@ class Training(Brief):
             self.screen_gradients.add(base.screen_gradient, base.splats, camera)
         if schedule.densifies(step, iterations):
             gradients, large = self.screen_gradients.mean, schedule.prunes_large(step)
+            self.gaussians.require_finite()
             self.replace_gaussians(
                 densify(self.gaussians, gradients, self.extent, schedule, self.generator, prune_large=large)
             )
@@ -349,6 +350,7 @@ class Training(Brief):
         """Continue with the Gaussians of a change; Adam's moments are kept with kept Gaussians, and 0 for new ones."""
         if not len(change.gaussians):
             raise InputError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
+        change.gaussians.require_finite()
         self.gaussians = change.gaussians
         self.adam.select(change.parents, change.fresh)
         flat = change.gaussians.flat

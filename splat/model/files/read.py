@@ -15,7 +15,7 @@ from splat.model.files import quantised, tensor_files
 from splat.model.files.ply import MAGIC, read_header
 from splat.model.files.splat_file import SplatFile
 from splat.model.files.splat_ply import read_splat_ply
-from splat.model.untrusted import require_modest
+from splat.model.untrusted import require_content, require_modest
 
 ZIP_MAGIC, LICHTFELD = b"PK\x03\x04", (b"LFKP", b"PKFL")
 LONGEST_SETTINGS = 1 << 16
@@ -64,6 +64,7 @@ def read_splats(path: Path) -> SplatFile:
     """
     if not path.is_file():
         raise FileNotFoundError(f"expected a file of Gaussians at {path}, found none")
+    require_content(path)
     try:
         return _with_settings(_read(path, path.read_bytes()), path)
     except InputError as error:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from landscape.errors import InputError
-from splat.model.untrusted import read_array
+from splat.model.untrusted import read_array, require_content
 from splat.scenes.images import Photo, checked_lens, image_files, image_folder
 
 POSES = "poses_bounds.npy"
@@ -19,7 +19,7 @@ POSES = "poses_bounds.npy"
 
 def read_llff(root: Path, images: str | None = None) -> list[Photo]:
     """Photographs sorted by name, with the depth range of each."""
-    path = root / POSES
+    require_content(path := root / POSES)
     try:
         with path.open("rb") as stream:
             rows = read_array(stream).astype(np.float64)

@@ -4,8 +4,9 @@
 to camera rotation here is diag(1, -1, -1) R^T.  Intrinsics stand at the top or in the frame, which wins:
 
     fl_x fl_y cx cy w h          px, pixel centres at + 0.5; cx, cy default to the middle, fl_y to fl_x
-    camera_angle_x               horizontal field of view, radians, where fl_x is not given
+    camera_angle_x, _y           fields of view, radians, where fl_x, fl_y is not given
     k1 k2 k3 p1 p2               OpenCV's radial and tangential distortion (k4 ... of a rational model are refused)
+    train_filenames, test_filenames     the split; val_filenames where there is no test_filenames
     mask_path                    the image's mask (`splat/scenes/layers.py`), from the folder of the file
     camera_model, is_fisheye     PINHOLE, SIMPLE_PINHOLE, OPENCV and the like; OPENCV_FISHEYE with k1 to k4; others are refused
     ply_file_path                points; an integer list property `views` of a vertex numbers the frames that see it
@@ -13,10 +14,10 @@ to camera rotation here is diag(1, -1, -1) R^T.  Intrinsics stand at the top or 
 
 Blender scenes have two files, `transforms_train.json` and `transforms_test.json`; the frames keep their order in the
 files, because the sparse-view protocols count them.  Frames of a single file are sorted by name.  Frames without an image,
-which captures often list, are skipped.
+which captures often list, are skipped.  Readers return notes too: sentences on that, and on keys that are not used.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isfinite, pi, tan
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from splat.model.files.ply import read_header, read_rows
-from splat.model.untrusted import inside, loose_json
+from splat.model.untrusted import inside, loose_json, require_content
 from splat.scenes.images import (
     PINHOLE_MODELS,
     RADIAL_MODELS,
@@ -36,6 +37,7 @@ from splat.scenes.images import (
     checked_lens,
     image_folder,
     image_header,
+    image_named,
     require_files,
 )
 from splat.scenes.view import Points, Subset
@@ -43,42 +45,87 @@ from splat.scenes.view import Points, Subset
 BLENDER_FILES: tuple[tuple[Subset, str], ...] = (("train", "transforms_train.json"), ("test", "transforms_test.json"))
 SINGLE_FILE = "transforms.json"
 FISHEYE = "OPENCV_FISHEYE"
-REFUSED_TERMS = ("k4", "k5", "k6")
-NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "k1", "k2", "k3", "p1", "p2", *REFUSED_TERMS)
+REFUSED_TERMS, OF_FISHEYES = ("k4", "k5", "k6"), ("k5", "k6", "p1", "p2")
+NUMBERS = (
+    "fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "p1", "p2", *REFUSED_TERMS,
+)  # fmt: skip
+SPLIT = ("train_filenames", "test_filenames", "val_filenames")
+USED = {  # the two applied_ ones by `splat/training/origin/frames.py`
+    *NUMBERS, *SPLIT, "frames", "file_path", "transform_matrix", "mask_path", "ply_file_path", "background", "camera_model",
+    "is_fisheye", "applied_transform", "applied_scale",
+}  # fmt: skip
+NO_MATTER = {"rotation", "sharpness", "colmap_im_id"}  # steps and marks of those who made the file
 
 
 def read_blender(root: Path, strict: bool = False) -> tuple[list[Photo], list[str]]:
-    """Training photographs, then test photographs, named by their path (`train/r_26`); and the frames skipped."""
-    photos, skipped = [], []
+    """Training photographs, then test photographs, named by their path (`train/r_26`); and notes."""
+    photos, skipped, unused = [], [], []
     for subset, name in BLENDER_FILES:
         data = _load(root / name)
-        paths = [_image_path(root, frame["file_path"]) for frame in data["frames"]]
-        found, missing = _photos(root / name, data, paths, subset, strict)
-        photos, skipped = photos + found, skipped + missing
-    return photos, skipped
+        paths = [image_named(inside(root, frame["file_path"])) for frame in data["frames"]]
+        found, missing = _photos(root / name, data, paths, dict.fromkeys(map(_name, data["frames"]), subset), strict)
+        photos, skipped, unused = photos + found, skipped + missing, unused + _unused(data, name)
+    return photos, [*_skipped(skipped, len(photos)), *unused]
 
 
 def read_transforms(
     root: Path, path: Path, images: str | None = None, strict: bool = False
 ) -> tuple[list[Photo], Points | None, list[float] | None, list[str]]:
-    """Photographs sorted by name, the points of `ply_file_path` and the background, where the file has them; and the
-    frames skipped."""
+    """Photographs sorted by name, the points of `ply_file_path` and the background, where the file has them; and notes."""
     data = _load(path)
     data["frames"].sort(key=lambda frame: frame["file_path"])
-    paths = [] if images is not None else [_image_path(root, frame["file_path"]) for frame in data["frames"]]
+    paths = [] if images is not None else [image_named(inside(root, frame["file_path"])) for frame in data["frames"]]
     if not any(p.is_file() for p in paths) and (images is not None or not (root / "images").exists()):
         folder = image_folder(root, images)
         paths = [_in_folder(folder, frame["file_path"]) for frame in data["frames"]]
-    photos, skipped = _photos(path, data, paths, None, strict)
+    subsets = _subsets(data, path)
+    photos, skipped = _photos(path, data, paths, subsets, strict)
     points = None
     if cloud := _file(data, "ply_file_path", path):
         points = read_points(inside(root, cloud), tuple(_name(frame) for frame in data["frames"]))
-    return photos, points, data.get("background"), skipped
+    notes = [*_skipped(skipped, len(photos)), *_unused(data, path.name)]
+    if left := sorted({photo.name for photo in photos} - subsets.keys()) if subsets else []:
+        notes.append(f"{len(left)} frames are in neither list of {path.name} to train and to test, such as {left[0]}")
+    return photos, points, data.get("background"), notes
+
+
+def _skipped(names: Sequence[str], there: int) -> list[str]:
+    """A note on frames without an image."""
+    count = f"{len(names)} of {len(names) + there} frames that the scene lists were skipped"
+    first = f"because their images are missing; the first is {names[0]}" if names else ""
+    return [f"{count}, {first} (--strict-frames refuses such a scene)"] if names else []
+
+
+def _unused(data: Mapping[str, Any], name: str) -> list[str]:
+    """A note on what a file says beside what is read."""
+    unused = {key for part in (data, *data["frames"]) for key in part} - USED - NO_MATTER
+    if "test_filenames" in data and {*data.get("val_filenames", ())} - {*data["test_filenames"]}:
+        unused.add("val_filenames")
+    words = ", ".join(key if key.isprintable() else repr(key) for key in sorted(unused))
+    return [f"{name} says {words}, which {'is' if len(unused) == 1 else 'are'} not used"] if unused else []
+
+
+def _subsets(data: Mapping[str, Any], path: Path) -> dict[str, Subset]:
+    """The part of each frame that the lists of the file name; empty without such lists."""
+    known, found = {_name(frame) for frame in data["frames"]}, {}
+    held_out = "val_filenames" if "test_filenames" not in data else "test_filenames"
+    parts: tuple[tuple[str, Subset], ...] = (("train_filenames", "train"), (held_out, "test"))
+    for key, subset in parts if any(key in data for key in SPLIT) else ():
+        names = data.get(key)
+        if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
+            raise InputError(f"expected a list of file paths of frames, got {key} = {names!r} in {path}"[:300])
+        for name in map(_posix, names):
+            if name not in known or name in found:
+                problem = f"{name!r}, which is in {found[name]}_filenames too" if name in found else f"{name!r}"
+                raise InputError(f"expected each of {key} to be one frame of {path} and in one list, got {problem}")
+        found |= dict.fromkeys(map(_posix, names), subset)
+    return found
 
 
 def _load(path: Path) -> dict[str, Any]:
+    require_content(path)
     try:
-        data = loose_json(path.read_text(encoding="utf-8"), parse_int=float)  # of which the largest is infinite
+        data = loose_json(path.read_text(encoding="utf-8-sig"), parse_int=float)  # of which the largest is infinite
     except (ValueError, OSError, RecursionError) as error:
         raise InputError(f"expected a JSON file with frames, cannot read {path}: {error}") from error
     frames = data.get("frames") if isinstance(data, dict) else None
@@ -87,33 +134,31 @@ def _load(path: Path) -> dict[str, Any]:
     for i, frame in enumerate(frames):
         if not (isinstance(frame, dict) and "transform_matrix" in frame and isinstance(frame.get("file_path"), str)):
             raise InputError(f"expected 'file_path' and 'transform_matrix' in frame {i} of {path}")
+        frame["file_path"] = frame["file_path"].replace("\\", "/")  # as Windows writes it
     return data
-
-
-def _image_path(folder: Path, file_path: str) -> Path:
-    """The file itself or, as Blender's exporter leaves the suffix away, the file with a suffix."""
-    path = inside(folder, file_path)
-    candidates = [path] + [path.with_name(path.name + suffix) for suffix in (".png", ".jpg", ".jpeg")]
-    return next((candidate for candidate in candidates if candidate.is_file()), path)
 
 
 def _in_folder(folder: Path, file_path: str) -> Path:
     """The file in another folder of the images: by its path below the folder that the file names, else by its name."""
     nested = Path(*Path(file_path).parts[1:]) if len(Path(file_path).parts) > 1 else Path(file_path)
-    found = _image_path(folder, str(nested))
-    return found if found.is_file() else _image_path(folder, Path(file_path).name)
+    found = image_named(inside(folder, str(nested)))
+    return found if found.is_file() else image_named(inside(folder, Path(file_path).name))
 
 
 def _name(frame: Mapping[str, Any]) -> str:
-    return Path(frame["file_path"]).as_posix()
+    return _posix(frame["file_path"])
+
+
+def _posix(path: str) -> str:
+    return Path(path.replace("\\", "/")).as_posix()
 
 
 def _photos(
-    path: Path, data: dict[str, Any], paths: list[Path], subset: Subset | None, strict: bool
+    path: Path, data: dict[str, Any], paths: list[Path], subsets: Mapping[str, Subset], strict: bool
 ) -> tuple[list[Photo], list[str]]:
     """The frames that have an image, and the names of the others; strict, or where none has one: refuses."""
     if not any(image.is_file() for image in paths):
-        require_files(paths, f"where {path} says" if subset else "or name another folder of images with --images")
+        require_files(paths, f"where {path} says, or name another folder of images with --images")
     if strict:
         require_files(paths, "or leave out --strict-frames")
     shared = {key: value for key, value in data.items() if key != "frames"}
@@ -127,7 +172,9 @@ def _photos(
         lens = _lens({**shared, **frame}, image_header(image)[0], name, path)
         mask = _file(frame, "mask_path", path)
         photos.append(
-            Photo(name, image, lens, rotation, centre, subset, mask=inside(path.parent, mask) if mask else None)
+            Photo(
+                name, image, lens, rotation, centre, subsets.get(name), mask=inside(path.parent, mask) if mask else None
+            )
         )
     return photos, skipped
 
@@ -137,7 +184,7 @@ def _file(values: Mapping[str, Any], key: str, path: Path) -> str | None:
     name = values.get(key)
     if name is not None and not isinstance(name, str):
         raise InputError(f"expected the name of a file, got {key} = {name!r} in {path}")
-    return name
+    return name and name.replace("\\", "/")
 
 
 def _pose(matrix: Any, name: str, path: Path) -> tuple[Tensor, Tensor]:
@@ -164,15 +211,20 @@ def _lens(values: Mapping[str, Any], size: tuple[int, int], name: str, path: Pat
             f"expected pinhole images, {FISHEYE}, or radial and tangential distortion, got camera_model {model} for {name!r} "
             f"in {path}: a pinhole renderer cannot draw it; undistort the photographs to pinhole images first"
         )
-    rational = [key for key in REFUSED_TERMS if values.get(key) and not (fisheye and key == "k4")]
-    if rational:
+    refused = [key for key in (OF_FISHEYES if fisheye else REFUSED_TERMS) if values.get(key)]
+    if refused:
+        known = "k1, k2, k3 and k4 of a fisheye" if fisheye else "k1, k2, k3, p1 and p2"
         raise InputError(
-            f"expected at most k1, k2, k3, p1 and p2, got {', '.join(rational)} for {name!r} in {path}, whose meaning "
-            "differs between tools; undistort the photographs to pinhole images first"
+            f"expected at most {known}, got {', '.join(refused)} for {name!r} in {path}, whose meaning differs between tools; "
+            "undistort the photographs to pinhole images first"
         )
     width, height = int(values.get("w", size[0])), int(values.get("h", size[1]))
-    fx = _focal(values, width, name, path)
-    fy = float(values.get("fl_y", fx))
+    fx, fy = (_focal(values, axis, side, name, path) for axis, side in (("x", width), ("y", height)))
+    if fx is None:
+        raise InputError(
+            f"expected fl_x or camera_angle_x for {name!r} in {path}, got neither; add the focal length in px"
+        )
+    fy = fx if fy is None else fy
     centre = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
     if fisheye:
         terms = [float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4")]
@@ -183,19 +235,20 @@ def _lens(values: Mapping[str, Any], size: tuple[int, int], name: str, path: Pat
     return checked_lens("FULL_OPENCV", (width, height), [fx, fy, *centre, k1, k2, p1, p2, k3, 0, 0, 0], name)
 
 
-def _focal(values: Mapping[str, Any], width: int, name: str, path: Path) -> float:
-    if "fl_x" in values:
-        return float(values["fl_x"])
-    if "camera_angle_x" in values:
-        angle = float(values["camera_angle_x"])
-        if not (0 < angle < pi and tan(angle / 2) > 0):  # half the least number there is, is 0
-            raise InputError(f"expected camera_angle_x above 0 and below pi, got {angle} for {name!r} in {path}")
-        return width / (2 * tan(angle / 2))
-    raise InputError(f"expected fl_x or camera_angle_x for {name!r} in {path}, got neither; add the focal length in px")
+def _focal(values: Mapping[str, Any], axis: str, side: int, name: str, path: Path) -> float | None:
+    """Focal length along x or y, px, also from the field of view; None where the file has neither."""
+    if (given := values.get(f"fl_{axis}")) is not None:
+        return float(given)
+    if (angle := values.get(f"camera_angle_{axis}")) is None:
+        return None
+    if not (0 < angle < pi and tan(angle / 2) > 0):  # half the least number there is, is 0
+        raise InputError(f"expected camera_angle_{axis} above 0 and below pi, got {angle} for {name!r} in {path}")
+    return side / (2 * tan(angle / 2))
 
 
 def read_points(path: Path, names: tuple[str, ...]) -> Points:
     """Points of a PLY file: x y z, red green blue (grey where there are none), and `views` if it is there."""
+    require_content(path)
     try:
         content = path.read_bytes()
         vertex = read_rows(content, read_header(content))

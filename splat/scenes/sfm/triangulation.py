@@ -1,6 +1,6 @@
 """Points triangulated from some views with known poses, so that a training starts from nothing of the views held out.
 
-    features     SIFT with affine shapes and pooling over scales, in the pictures as the training sees them
+    features     SIFT with affine shapes and pooling over scales, in the photographs before they are reduced
     matches      of every pair of views
     points       triangulated with COLMAP's thresholds (reprojection error 4 px, angle 1.5 degrees), poses and lenses fixed
 
@@ -20,24 +20,26 @@ import pycolmap
 from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.scenes.formats.colmap import points_of
-from splat.scenes.view import Points, View
+from splat.scenes.view import Frame, Points
 from splat.scenes.write import bytes_of, png
 
 SEED = 0  # of RANSAC: the same views give the same points
 
 
-def triangulated_points(views: Sequence[View]) -> Points:
+def triangulated_points(frames: Sequence[Frame]) -> Points:
     """The points that at least two of these views show.  InputError where there are fewer than two views, or no point."""
-    if len(views) < 2:
-        raise InputError(f"expected at least 2 views to triangulate from, got {len(views)}; start from random points")
+    if len(frames) < 2:
+        raise InputError(f"expected at least 2 views to triangulate from, got {len(frames)}; start from random points")
     with tempfile.TemporaryDirectory() as folder, quiet():
         database, pictures, output = (Path(folder) / name for name in ("database.db", "images", "output"))
         pictures.mkdir()
         output.mkdir()
-        posed = _posed_without_points(views)
+        posed = pycolmap.Reconstruction()
+        for number, frame in enumerate(frames, start=1):  # one photograph at a time is in memory
+            view = frame.whole_view()
+            name = _add(posed, view.camera, number)
+            (pictures / name).write_bytes(png(bytes_of(view.image)))
         _write_database(posed, database)
-        for image, view in zip(_in_order(posed), views, strict=True):
-            (pictures / image.name).write_bytes(png(bytes_of(view.image)))
         features = pycolmap.FeatureExtractionOptions()
         features.use_gpu = False
         features.sift.estimate_affine_shape = True
@@ -51,10 +53,10 @@ def triangulated_points(views: Sequence[View]) -> Points:
     points = points_of(model, _in_order(model))
     if points is None:
         raise InputError(
-            f"expected places that two of the {len(views)} training views show, found none that match; "
-            "choose views that overlap more, or start from random points"
+            f"expected places that two of the {len(frames)} training views show, found none that match; "
+            "start from dense or random points, or choose views that overlap more"
         )
-    return Points(points.xyz, points.rgb, points.observations, tuple(view.name for view in views))
+    return Points(points.xyz, points.rgb, points.observations, tuple(frame.name for frame in frames))
 
 
 def matching() -> pycolmap.FeatureMatchingOptions:
@@ -82,15 +84,14 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def _posed_without_points(views: Sequence[View]) -> pycolmap.Reconstruction:
-    """A model with image i + 1 and camera i + 1 for view i; images are named by their numbers."""
-    model = pycolmap.Reconstruction()
-    for i, view in enumerate(views, start=1):
-        model.add_camera_with_trivial_rig(_lens(view.camera, i))
-        rotation, centre = view.camera.rotation.numpy(), view.camera.centre.numpy()
-        pose = pycolmap.Rigid3d(np.concatenate([rotation, -(rotation @ centre)[:, None]], axis=1))
-        model.add_image_with_trivial_frame(pycolmap.Image(f"{i:06d}.png", np.zeros((0, 2)), i, i), pose)
-    return model
+def _add(model: pycolmap.Reconstruction, camera: Camera, number: int) -> str:
+    """Give the model an image without points, and its camera, both of this number; returns the image's name."""
+    model.add_camera_with_trivial_rig(_lens(camera, number))
+    rotation, centre = camera.rotation.numpy(), camera.centre.numpy()
+    pose = pycolmap.Rigid3d(np.concatenate([rotation, -(rotation @ centre)[:, None]], axis=1))
+    name = f"{number:06d}.png"
+    model.add_image_with_trivial_frame(pycolmap.Image(name, np.zeros((0, 2)), number, number), pose)
+    return name
 
 
 def _lens(camera: Camera, camera_id: int) -> pycolmap.Camera:

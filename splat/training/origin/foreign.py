@@ -28,7 +28,7 @@ from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, explicit_split, split_scene
 from splat.scenes.view import View
 from splat.scenes.write import bytes_of, png
-from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_frame, posed
+from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_frame, posed, shift_of, shift_to_origin
 from splat.training.origin.presets import PRESETS, Preset, preset_of, render_of
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig, Training
@@ -84,7 +84,7 @@ def foreign_training(path: Path, ask: Foreign, picture: Path) -> tuple[Training,
     reference = SceneReference.to(scene, path, split, images, downscale)
     config = _config(scene, found, preset.loss, render, ask)
     poses = [
-        Pose(gaussians, world, note)
+        Pose(_near(gaussians, world) if preset.world == "scene" else gaussians, world, note)
         for gaussians, note in ((found.gaussians, ()), (found.other_axes, (TURNED_BACK,)))
         if gaussians is not None
         for world in _worlds(preset, scene, path)
@@ -149,6 +149,8 @@ def _split(scene: Scene, found: SplatFile, ask: Foreign, path: Path) -> tuple[Sp
             return explicit_split(scene.names, train, held_out.test), "from cameras.json and cfg_args"
     if "eval" in found.settings:
         return held_out, "from cfg_args"
+    if held_out.protocol == "named":
+        return held_out, "as the scene's file lists them"
     if found.tool == "nerfstudio" and scene.kind == "transforms":
         count = len(scene.names)
         places = np.linspace(0, count - 1, ceil(count * NERFSTUDIO_SHARE), dtype=int)
@@ -217,7 +219,19 @@ def _left_out(found: SplatFile, loss: LossSettings) -> list[str]:
 def _worlds(preset: Preset, scene: Scene, path: Path) -> Sequence[Similarity | None]:
     if preset.world == "gsplat":
         return gsplat_frames(scene)
-    return [nerfstudio_frame(path, scene)] if preset.world == "nerfstudio" else [None]
+    return [nerfstudio_frame(path, scene) if preset.world == "nerfstudio" else shift_to_origin(scene)]
+
+
+def _near(gaussians: Gaussians, world: Similarity | None) -> Gaussians:
+    """The Gaussians in a world that was moved to its cameras: moved too, unless they lie there already."""
+    shift = None if world is None else shift_of(world.tolist())
+    if shift is None:
+        return gaussians
+    away = torch.tensor(shift, dtype=torch.float64)
+    means = gaussians.means.double()
+    if means.median(dim=0).values.norm() > away.norm() / 2:
+        means = means - away
+    return replace(gaussians, flat=Gaussians.pack(gaussians.attributes | {"means": means.to(gaussians.flat)}).flat)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,13 +11,15 @@ gsplat       `simple_trainer` normalises: up becomes -y (the mean of the cameras
              the median of the points becomes the origin and their principal axes x, y, z, by falling variance
              (gsplat, examples/datasets/normalize.py and colmap.py).  It is not stored, and the signs of the axes are those of
              an eigenvalue solver: `gsplat_frames` are the four that are possible
-nerfstudio   `dataparser_transforms.json`: x' = scale (transform x), from the world before the `applied_transform` of a
-             transforms.json
+nerfstudio   `dataparser_transforms.json`: x' = scale (transform x), from the world before the `applied_transform` and the
+             `applied_scale` of a transforms.json
+near         x' = x - c, c the middle of the cameras, where they are so far from the scene's origin (in coordinates of a map)
+             that float32 moves pixels, see `shift_to_origin`
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -27,23 +29,69 @@ from jaxtyping import Float
 
 from landscape.errors import InputError
 from splat.model.camera import Camera
+from splat.model.capture import common_target
 from splat.model.untrusted import loose_json
 from splat.scenes.formats.transforms import SINGLE_FILE
 from splat.scenes.scene import Scene
-from splat.scenes.view import Frame, View
+from splat.scenes.view import Frame
 
 Similarity = Float[np.ndarray, "3 4"]
 HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 NERFSTUDIO_FILE = "dataparser_transforms.json"
+LARGEST_ROUNDING = 1e-3  # px
 ROUND_OFF = 1e-4  # of a rotation that was stored in single precision
 
 
+def shift_to_origin(scene: Scene) -> Similarity | None:
+    """The shift of a scene whose world float32 cannot hold; None where it can.
+
+    Numbers of float32 at |c| from the origin are eps |c| apart.  At the scene's depth z, through a focal length of f pixels,
+    this is eps |c| f / z pixels.  Allowed are 1e-3, as much as Adam's last steps of positions move a splat where cameras
+    surround the scene (`LearningRates.position_final`).  c is rounded to float32, so that the shift itself rounds nothing.
+    """
+    cameras = [frame.camera for frame in scene.frames]
+    centres = torch.stack([camera.centre for camera in cameras])
+    middle = centres.mean(dim=0)
+    place = common_target(cameras) if scene.points is None else scene.points.xyz.median(dim=0).values
+    away = centres - (middle if place is None else place)
+    focal = max(camera.fx for camera in cameras)
+    apart = torch.finfo(torch.float32).eps * float(middle.norm()) * focal
+    if apart <= LARGEST_ROUNDING * float(away.norm(dim=1).median()):
+        return None
+    return np.column_stack([np.eye(3), -middle.float().double().numpy()])
+
+
+def shift_of(similarity: Sequence[Sequence[float]] | None) -> list[float] | None:
+    """The c of a world that is moved by -c and nothing else; None of any other."""
+    if similarity is None or any(row[:3] != unit for row, unit in zip(similarity, np.eye(3).tolist())):
+        return None
+    return [-row[3] for row in similarity]
+
+
+def shift_in_words(shift: Sequence[float]) -> str:
+    """Note on a world that is moved."""
+    size = np.linalg.norm(shift)
+    step = torch.finfo(torch.float32).eps * size
+    return (
+        f"the world is moved by -({', '.join(f'{each:.9g}' for each in shift)}) to its cameras: {size:.3g} from the origin, "
+        f"numbers of float32 are {step:.1g} apart; positions of Gaussians are in the moved world"
+    )
+
+
 def posed(scene: Scene, similarity: Sequence[Sequence[float]] | None, *, centred: bool) -> Scene:
-    """The scene with its cameras moved, without its points.  centred: with the principal points in the images' middles."""
+    """The scene with its cameras and points moved.  centred: with the principal points in the images' middles."""
     if similarity is None and not centred:
         return scene
-    frames = [_posed(frame, None if similarity is None else np.array(similarity), centred) for frame in scene.frames]
-    return replace(scene, frames=tuple(frames), points=None)
+    world = None if similarity is None else np.array(similarity)
+    points, notes, shift = scene.points, scene.notes, shift_of(similarity)
+    if points is not None and world is not None:
+        matrix = torch.from_numpy(world)
+        points = replace(points, xyz=points.xyz @ matrix[:, :3].T + matrix[:, 3])
+    if shift is not None:
+        notes = (*notes, shift_in_words(shift))
+    return replace(
+        scene, frames=tuple(_posed(frame, world, centred) for frame in scene.frames), points=points, notes=notes
+    )
 
 
 def _posed(frame: Frame, similarity: Similarity | None, centred: bool) -> Frame:
@@ -54,17 +102,13 @@ def _posed(frame: Frame, similarity: Similarity | None, centred: bool) -> Frame:
     if centred:
         camera = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
     depths = frame.depth_range and (scale * frame.depth_range[0], scale * frame.depth_range[1])
-    return replace(frame, camera=camera, view=partial(_view, frame, camera), depth_range=depths)
+    return replace(frame, camera=camera, depth_range=depths)
 
 
 def moved(camera: Camera, similarity: Similarity, scale: float) -> Camera:
     """R' = R Q^T, c' = s Q c + t."""
     turn, shift = torch.from_numpy(similarity[:, :3] / scale), torch.from_numpy(similarity[:, 3].copy())
     return replace(camera, rotation=camera.rotation @ turn.T, centre=scale * turn @ camera.centre + shift)
-
-
-def _view(frame: Frame, camera: Camera) -> View:
-    return replace(frame.view(), camera=camera)
 
 
 def gsplat_frames(scene: Scene) -> list[Similarity]:
@@ -117,7 +161,12 @@ def nerfstudio_frame(checkpoint: Path, scene: Scene) -> Similarity:
         raise InputError(f"expected a transform and a scale in {path} ({error!r})") from error
     similarity = scale * _rigid(rigid, path)
     original = scene.root / SINGLE_FILE
-    if scene.kind == "transforms" and original.is_file() and "applied_transform" in (values := _json(original)):
+    values = _json(original) if scene.kind == "transforms" and original.is_file() else {}
+    if (applied_scale := values.get("applied_scale", 1.0)) != 1.0:
+        if not (isinstance(applied_scale, int | float) and 0 < applied_scale < inf):
+            raise InputError(f"expected an applied_scale above 0 in {original}, got {applied_scale!r}")
+        similarity = similarity / applied_scale
+    if "applied_transform" in values:
         try:
             applied = _rigid(np.array(values["applied_transform"], dtype=np.float64), original)
         except (TypeError, ValueError) as error:

@@ -507,3 +507,10 @@ def test_a_run_stands_for_its_checkpoint_and_a_checkpoint_for_its_run(tmp_path):
 def test_the_version_is_said(capsys):
     assert main(["--version"]) == 0
     assert re.fullmatch(r"splat-landscape \d+\.\S+\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("command", ["train", "probe", "slice", "map", "prune", "uncertainty"])
+@pytest.mark.parametrize("seed", ["-1", str(2**63)])
+def test_every_command_has_the_same_rule_for_seeds(tmp_path, capsys, command, seed):
+    assert main([command, str(tmp_path), "--seed", seed]) == 2
+    assert f"expected a seed in [0, 2^63), got {seed}" in capsys.readouterr().err

@@ -98,7 +98,7 @@ def test_frames_without_an_image_and_a_poor_start_are_said(original, tmp_path, c
     assert train(scene, tmp_path / "run") == 0
     said = capsys.readouterr().err
     assert "1 of 5 frames that the scene lists were skipped" in said and "images/view_001.png" in said
-    assert "points only, and may leave places empty; take more --views" in said
+    assert "points only, and may leave places empty; --start dense finds more" in said
     assert train(scene, tmp_path / "random", "--start", "random") == 0
     assert "random points, of which most lie on no surface" in capsys.readouterr().err
     sources: tuple[Source, ...] = get_args(Source)

@@ -106,11 +106,42 @@ def test_masks_that_cannot_be_are_refused(tmp_path: Path, pixels: np.ndarray, me
         load_scene(tmp_path, downscale=2).load()
 
 
-def test_a_mask_of_colours_is_inside_where_every_channel_is_white(tmp_path: Path) -> None:
-    pixels = np.zeros((2, 3, 3), dtype=np.uint8)
-    pixels[0, 1], pixels[1, 2] = 255, (255, 255, 254)
-    Image.fromarray(pixels).save(tmp_path / "m.png")
-    assert read_mask(tmp_path / "m.png").tolist() == [[[0, 1, 0], [0, 0, 0]]]
+def inside(path: Path, image: Image.Image, **save: int) -> np.ndarray:
+    image.save(path, **save)
+    return read_mask(path)[0].numpy() == 1
+
+
+def test_a_mask_is_inside_where_it_is_nearer_to_white_in_any_kind_of_file(tmp_path: Path) -> None:
+    drawn = blob(8 * WIDTH, 8 * HEIGHT)
+    grey = (drawn * 250).astype(np.uint8)
+    grey[tuple(np.argwhere(drawn)[0])] = 255  # one brighter pixel is no other mask
+    assert np.array_equal(inside(tmp_path / "m.png", Image.fromarray(grey)), drawn)
+    for quality in (50, 90):  # JPEG's noise reaches far into the white
+        off = inside(tmp_path / "m.jpg", Image.fromarray(drawn.astype(np.uint8) * 255), quality=quality) != drawn
+        assert off.mean() < 0.002 and not off[drawn ^ ~drawn & off].all()
+    assert np.array_equal(inside(tmp_path / "m.png", Image.fromarray(drawn.astype(np.uint16) * 65535)), drawn)
+    assert np.array_equal(inside(tmp_path / "m.png", Image.fromarray(drawn)), drawn)  # of one bit
+    palette = Image.fromarray(1 - drawn.astype(np.uint8)).convert("P")
+    palette.putpalette([255, 255, 255, 0, 0, 0])
+    assert np.array_equal(inside(tmp_path / "m.png", palette), drawn)
+    for colour in (255, 90):  # a cut-out picture: its alpha is the mask
+        layers = [np.full_like(grey, colour)] * 3 + [drawn.astype(np.uint8) * 255]
+        assert np.array_equal(inside(tmp_path / "m.png", Image.fromarray(np.stack(layers, axis=2))), drawn)
+    opaque = np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=2)
+    assert np.array_equal(inside(tmp_path / "m.png", Image.fromarray(opaque)), drawn)
+
+
+def test_labels_colours_and_soft_masks_are_refused(tmp_path: Path) -> None:
+    row, column = np.mgrid[:HEIGHT, :WIDTH]
+    labels, ramp = (column // 8).astype(np.uint8), (column * 10).astype(np.uint8)
+    red = np.stack([blob() * 128, np.zeros_like(row), np.zeros_like(row)], axis=2).astype(np.uint8)
+    soft = np.stack([np.full_like(ramp, 255)] * 3 + [ramp], axis=2)
+    for pixels in (labels, (column % 3 == 0).astype(np.uint8) * 7, ramp, red, soft):
+        with pytest.raises(InputError, match="labels, or a soft mask; write 255"):
+            inside(tmp_path / "m.png", Image.fromarray(pixels))
+
+
+def test_a_tall_mask_is_read_in_strips(tmp_path: Path) -> None:
     tall = np.zeros((2 * STRIP + 5, 3, 3), dtype=np.uint8)
     tall[[0, STRIP, -1], 1] = 255
     Image.fromarray(tall).save(tmp_path / "m.png")
@@ -160,6 +191,7 @@ def test_depth_maps_keep_their_numbers_at_any_scale_of_the_picture(tmp_path: Pat
         (np.array([[None, 1], [2, 3]]), "cannot read"),
         (np.zeros((0, 3)), r"of shape \(h, w\), got float64 of shape \(0, 3\)"),
         (np.array([[1e39, 0.0], [0.0, 1.0]]), "finite depths, got 1 that are not"),
+        (np.zeros((3, 0)), r"of shape \(h, w\), got float64 of shape \(3, 0\)"),
     ],
 )
 def test_depth_maps_that_cannot_be_are_refused(tmp_path: Path, values: np.ndarray, message: str) -> None:
@@ -204,3 +236,22 @@ def test_a_picture_whose_header_is_cut_is_refused_with_its_name(tmp_path):
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + (12).to_bytes(4, "big") + header + crc32(header).to_bytes(4, "big"))
     with pytest.raises(InputError, match=r"expected a mask, cannot read .*mask\.png: Truncated IHDR"):
         read_mask(path)
+
+
+@pytest.mark.parametrize("name", ["images/a.png", "masks/a.png", "depth/a.npy", "transforms.json", "p.ply"])
+def test_a_pointer_of_git_lfs_is_named_in_any_file_of_a_scene(tmp_path, name):
+    folders.write_transforms(tmp_path, ply_file_path="p.ply" if name == "p.ply" else None)
+    for folder in ("masks", "depth"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12345\n")
+    depths = tmp_path / "depth" if name == "depth/a.npy" else None
+    with pytest.raises(
+        InputError, match=rf"{Path(name).name}.*, got a pointer of git lfs in its place; run `git lfs pull`"
+    ):
+        load_scene(tmp_path, depths=depths).load()
+
+
+def test_an_empty_depth_map_is_refused_with_its_name(tmp_path):
+    (tmp_path / "d.npy").touch()
+    with pytest.raises(InputError, match=r"expected a depth map, cannot read .*d\.npy"):
+        read_depth(tmp_path / "d.npy")

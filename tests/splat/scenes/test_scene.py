@@ -17,7 +17,7 @@ from tests.splat.scenes.folders import NAMES
 
 def scene_of(cameras: list[Camera]) -> Scene:
     pictures = [View(f"{i}", camera, torch.zeros(3, 2, 2)) for i, camera in enumerate(cameras)]
-    frames = tuple(Frame(view.name, view.camera, lambda view=view: view) for view in pictures)
+    frames = tuple(Frame(view.name, view.camera, lambda camera, view=view: view) for view in pictures)
     return Scene("s", Path("s"), "synthetic", frames, None, torch.zeros(3))
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from splat.model.camera import Camera
 from splat.model.capture import forward_facing
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import rotation_matrices
@@ -119,7 +120,7 @@ def test_tracks_follow_their_frames_into_the_order_of_the_file(small: SyntheticS
 
 def test_names_in_two_folders_and_a_background_survive_a_round_trip(small: SyntheticScene, tmp_path: Path) -> None:
     names = ("train/r_2", "test/r_2")
-    frames = tuple(Frame(name, f.camera, f.view) for name, f in zip(names, small.scene.frames))
+    frames = tuple(Frame(name, f.camera, f.picture) for name, f in zip(names, small.scene.frames))
     write_transforms_scene(Scene("s", tmp_path, "blender", frames, None, torch.ones(3)), tmp_path / "s")
     scene = load_scene(tmp_path / "s")
     assert scene.names == ("images/test/r_2.png", "images/train/r_2.png")
@@ -128,7 +129,7 @@ def test_names_in_two_folders_and_a_background_survive_a_round_trip(small: Synth
 
 
 def test_a_scene_is_written_whole_or_not_at_all(small: SyntheticScene, tmp_path: Path) -> None:
-    def fail() -> View:
+    def fail(camera: Camera) -> View:
         raise OSError("disk full")
 
     broken = (*small.scene.frames[:2], Frame("images/z.png", small.scene.frames[2].camera, fail))

@@ -13,7 +13,7 @@ def camera(x: float = 0.0) -> Camera:
 
 
 def frame(name: str, x: float = 0.0) -> Frame:
-    return Frame(name, camera(x), lambda: View(name, camera(x), torch.zeros(3, 6, 8)))
+    return Frame(name, camera(x), lambda own: View(name, own, torch.zeros(3, 6, 8)))
 
 
 def xyz(*rows: tuple[float, float, float]) -> torch.Tensor:
@@ -69,13 +69,11 @@ def test_a_shelf_keeps_the_pictures_used_last_and_reads_the_others_again(monkeyp
     read = []
 
     def made(name: str, layers: frozenset[str] = frozenset()) -> Frame:
-        def view() -> View:
+        def picture(own: Camera) -> View:
             read.append(name)
-            return View(
-                name, camera(), torch.full((3, 6, 8), float(ord(name))), mask=torch.ones(6, 8, dtype=torch.bool)
-            )
+            return View(name, own, torch.full((3, 6, 8), float(ord(name))), mask=torch.ones(6, 8, dtype=torch.bool))
 
-        return Frame(name, camera(), view, layers=layers)
+        return Frame(name, camera(), picture, layers=layers)
 
     frames = [made("a"), made("b"), made("c", frozenset({"mask"}))]
     shelf = Shelf(2 * frames[0].bytes)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from landscape.errors import InputError
 from splat.backend.cpu.adam import EPS
 from splat.losses.reference import LossSettings, photometric_loss
 from splat.model.settings import RenderSettings
@@ -372,3 +373,45 @@ def test_gaussians_that_no_view_shows_are_left_alone():
     training = Training.start(behind, EXTENT, TrainConfig(3, densify=ONLY_ADAM))
     losses = [done.loss for done in train(training, tiny_views())]
     assert len(losses) == 3 and torch.equal(training.gaussians.flat, behind.flat)
+
+
+def test_gaussians_nearer_than_the_near_plane_are_refused_before_a_step():
+    gaussians, views = tiny_gaussians(), tiny_views()
+    gaussians.means.mul_(1e-3)
+    small = [replace(view, camera=replace(view.camera, centre=view.camera.centre * 1e-3)) for view in views]
+    training = Training.start(gaussians, EXTENT, tiny_config(16))
+    with pytest.raises(
+        InputError, match=rf"got {len(gaussians)}, of which none of {len(views)} views .* up to [1-9]\d* lie nearer"
+    ):
+        prepare(training, small)
+    gaussians.means.fill_(1e6)  # neither near nor in an image
+    with pytest.raises(InputError, match=r"up to 0 lie nearer than the near plane at 0\.2"):
+        prepare(Training.start(gaussians, EXTENT, tiny_config(16)), small)
+
+
+def test_a_gradient_of_0_ends_a_training_after_a_look_at_each_view():
+    gaussians, views = tiny_gaussians(), tiny_views()
+    gaussians.opacity_logits.fill_(-20.0)  # in sight, below what is drawn
+    with pytest.raises(InputError, match=f"exactly 0 in the first {len(views)} steps"):
+        list(train(Training.start(gaussians, EXTENT, tiny_config(16)), views))
+
+
+def test_gaussians_that_density_control_cannot_use_or_makes_end_a_training_with_a_sentence():
+    training = Training.start(tiny_gaussians(), EXTENT, tiny_config(16))
+    settings, gradients = DensifySettings(), torch.ones(len(training.gaussians))
+    training.gaussians.log_scales.fill_(100.0)  # finite, but not the places that are drawn from them
+    change = densify(training.gaussians, gradients, EXTENT, settings, training.generator, prune_large=False)
+    with pytest.raises(InputError, match="expected finite means, got"):
+        training.replace_gaussians(change)
+    far = Training.start(tiny_gaussians(), EXTENT, tiny_config(16))
+    base = loss_and_gradient(
+        far.gaussians,
+        tiny_views()[0].camera,
+        far.config.loss_against(tiny_views()[0].image, far.gaussians.flat),
+        torch.zeros(3),
+    )
+    far.gaussians.means[0] = float("inf")
+    schedule = far.config.densify
+    step = next(n for n in range(1, 16) if schedule.densifies(n, 16))
+    with pytest.raises(InputError, match=r"expected finite means, got .*inf"):
+        far.control_density(step, tiny_views()[0].camera, base)

@@ -34,15 +34,21 @@ def test_colmap_cameras_points_and_tracks_come_back(tmp_path: Path, text: bool, 
     assert seen == [list(SEEN[p]) for p in wanted]
 
 
-def test_of_several_models_the_first_is_taken_else_that_of_most_images(tmp_path: Path) -> None:
-    for at, keep in (("sparse/1", 1), ("sparse/2", 3), ("sparse/10", 2)):
-        folders.write_colmap(tmp_path, True, at)
-        lines = (tmp_path / at / "images.txt").read_text().splitlines()
-        body = [line for line in lines if not line.startswith("#")]
-        (tmp_path / at / "images.txt").write_text("\n".join(body[: 2 * keep]) + "\n")
-    assert find_model(tmp_path) == tmp_path / "sparse/2"
-    folders.write_colmap(tmp_path, True, "sparse/0")
-    assert find_model(tmp_path) == tmp_path / "sparse/0"
+@pytest.mark.parametrize("text", [False, True], ids=["bin", "txt"])
+@pytest.mark.parametrize("parent", ["sparse", "colmap/sparse"])
+def test_of_several_models_that_of_most_images_is_taken_and_said(tmp_path: Path, parent: str, text: bool) -> None:
+    for number, left_out in (("0", (1, 2)), ("2", ()), ("10", (3,))):
+        model = folders.reconstruction()
+        for frame in left_out:
+            model.deregister_frame(frame)
+        folders.write_colmap(tmp_path, text, f"{parent}/{number}", model)
+    assert find_model(tmp_path) == tmp_path / parent / "2"
+    scene = load_scene(tmp_path)
+    assert scene.names == NAMES
+    assert f"{parent}/2 of 3; not {parent}/0 of " in scene.notes[0] and f", {parent}/10 of " in scene.notes[0]
+    shutil.rmtree(tmp_path / parent / "2")
+    folders.write_colmap(tmp_path, text, f"{parent}/11")
+    assert find_model(tmp_path) == tmp_path / parent / "11"  # not by the first digit
 
 
 @pytest.mark.parametrize("there", [True, False])
@@ -230,3 +236,77 @@ def test_points_of_fern_have_the_photographs_colour_at_their_pixels(fern: Path) 
     views = scene.load()
     here = difference((0, 0))
     assert all(difference(shift) > here for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)))
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["bin", "txt"])
+def test_a_model_without_points_is_read_and_one_without_cameras_named(tmp_path: Path, text: bool) -> None:
+    folders.write_colmap(tmp_path, text)
+    suffix = ".txt" if text else ".bin"
+    (tmp_path / f"sparse/0/points3D{suffix}").unlink()
+    scene = load_scene(tmp_path)
+    assert scene.points is None and scene.notes == (
+        f"the COLMAP model sparse/0 has no points3D{suffix}: the scene is without points",
+    )
+    require_poses(scene)
+    (tmp_path / f"sparse/0/cameras{suffix}").rename(tmp_path / "elsewhere")
+    with pytest.raises(FileNotFoundError, match=rf"found .*sparse/0/images\{suffix} without cameras"):
+        load_scene(tmp_path)
+
+
+def test_a_text_model_from_another_system_is_read(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path, text=True)
+    for name in ("cameras", "images", "points3D"):
+        path = tmp_path / f"sparse/0/{name}.txt"
+        text = path.read_text().replace("b.png", "my photo (b).png").replace("c.png", "left\\c.png").rstrip("\n")
+        path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    (tmp_path / "images/b.png").rename(tmp_path / "images/my photo (b).png")
+    (tmp_path / "images/left").mkdir()
+    (tmp_path / "images/c.png").rename(tmp_path / "images/left/c.png")
+    scene = load_scene(tmp_path)
+    assert scene.names == ("a.png", "left/c.png", "my photo (b).png")
+    assert scene.points is not None and len(scene.points) == len(XYZ)
+    centres = {frame.name: frame.camera.centre.numpy() for frame in scene.frames}
+    for name, pose in zip(("a.png", "my photo (b).png", "left/c.png"), folders.poses()):
+        np.testing.assert_allclose(centres[name], pose.centre, atol=folders.ROUND_OFF)
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\n\n\n"])
+def test_an_image_that_sees_nothing_may_be_the_last_line(tmp_path: Path, end: str) -> None:
+    folders.write_colmap(tmp_path, text=True)
+    (tmp_path / "sparse/0/points3D.txt").write_text("")
+    lines = [line for line in (tmp_path / "sparse/0/images.txt").read_text().splitlines() if not line.startswith("#")]
+    (tmp_path / "sparse/0/images.txt").write_text("\n\n".join(lines[::2]) + end)
+    require_poses(load_scene(tmp_path))
+    (tmp_path / "sparse/0/images.txt").write_text("1 0.5 0.5")
+    with pytest.raises(InputError, match=r"in each line of an image in .*images\.txt, got '1 0\.5 0\.5'"):
+        load_scene(tmp_path)
+
+
+def test_photographs_without_a_pose_are_counted_and_hidden_files_are_none(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path)
+    for name in NAMES:
+        (tmp_path / "images" / f"._{name}").write_bytes(b"\0\5\x16\7")
+    assert load_scene(tmp_path).notes == ()
+    folders.write_pictures(tmp_path / "images", ("d.png", "e.JPG"))
+    (note,) = load_scene(tmp_path).notes
+    assert note.startswith("2 photographs in images have no pose") and note.endswith("the first is d.png")
+
+
+def test_files_with_other_poses_are_said(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path)
+    for name in ("transforms.json", "poses_bounds.npy"):
+        (tmp_path / name).touch()
+    assert load_scene(tmp_path).notes == (
+        "the poses are those of sparse/0; not read: poses_bounds.npy, transforms.json",
+    )
+
+
+@pytest.mark.parametrize("second", ["right/a.png", "a.PNG", "a.jpg"])
+def test_two_views_of_one_file_are_refused(tmp_path: Path, second: str) -> None:
+    folders.write_colmap(tmp_path, text=True)
+    images = tmp_path / "sparse/0/images.txt"
+    first, third = ("left/a.png", "left/c.png") if "/" in second else ("a.tif", "c.tif")
+    images.write_text(images.read_text().replace("a.png", first).replace("b.png", second).replace("c.png", third))
+    views = ", ".join(sorted([first, second]))
+    with pytest.raises(InputError, match=rf"a\.png' more than once \(1 such\), for the views {views}; give each"):
+        load_scene(tmp_path)

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from landscape.errors import InputError
 from splat.scenes.formats.transforms import read_points
 from splat.scenes.scene import load_scene
+from splat.scenes.splits import Split, split_scene, usual_views
 from splat.scenes.view import pixel_coordinates
 from tests.splat.scenes import folders
 from tests.splat.scenes.folders import CENTRE, FOCAL, NAMES, SIZE, intrinsics, poses, require_poses
@@ -129,7 +131,11 @@ def test_frames_without_an_image_are_skipped_and_counted(tmp_path: Path) -> None
     (tmp_path / "images" / NAMES[0]).unlink()
     scene = load_scene(tmp_path)
     assert scene.names == tuple(f"images/{name}" for name in NAMES[1:])
-    assert scene.skipped == (f"images/{NAMES[0]}",)
+    (note,) = scene.notes
+    assert (
+        note.startswith("1 of 3 frames that the scene lists were skipped")
+        and f"the first is images/{NAMES[0]} " in note
+    )
     assert scene.points is not None and scene.points.sightings(scene.frames).tolist() == [1, 2]
     with pytest.raises(
         FileNotFoundError, match=r"3 image files, 1 are missing, the first is .*leave out --strict-frames"
@@ -142,7 +148,8 @@ def test_a_blender_scene_skips_frames_of_both_files(tmp_path: Path) -> None:
     for name in ("train/r_2.png", "test/r_8.png"):
         (tmp_path / name).unlink()
     scene = load_scene(tmp_path)
-    assert (scene.names, scene.skipped) == (("train/r_26", "test/r_0"), ("train/r_2", "test/r_8"))
+    assert scene.names == ("train/r_26", "test/r_0")
+    assert [note[:6] for note in scene.notes] == ["2 of 4"] and "the first is train/r_2 " in scene.notes[0]
     (tmp_path / "test/r_0.png").unlink()
     with pytest.raises(
         FileNotFoundError, match=r"2 image files, 2 are missing, the first is .*transforms_test.json says"
@@ -199,3 +206,110 @@ def test_lego_stands_where_all_its_cameras_look(lego: Path) -> None:
         corner = view.image[:, 0, 0]
         assert view.alpha[0, 0] == 0 and corner.tolist() == [1, 1, 1]
     assert all(view.alpha[45:55, 45:55].mean() > 0.3 for view in views if view.alpha is not None)
+
+
+def rewrite(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    folders.write_transforms(folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    change(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def test_both_angles_of_view_give_their_focal_lengths(tmp_path: Path) -> None:
+    def angles(content: dict[str, Any]) -> None:
+        for key, side in zip("xy", SIZE):
+            content[f"camera_angle_{key}"] = 2 * np.arctan(side / 2 / content.pop(f"fl_{key}"))
+
+    rewrite(tmp_path / "s", angles)
+    camera = load_scene(tmp_path / "s").frames[0].camera
+    assert (camera.fx, camera.fy) == pytest.approx(FOCAL, rel=folders.ROUND_OFF)
+    rewrite(tmp_path / "wide", lambda content: (content.pop("fl_y"), content.update(camera_angle_y=4.0)))
+    with pytest.raises(InputError, match=r"camera_angle_y above 0 and below pi, got 4\.0"):
+        load_scene(tmp_path / "wide")
+
+
+def test_a_key_that_is_not_used_is_said_and_others_are_not(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path / "plain", applied_scale=1.0, k1=0.0)
+    assert load_scene(tmp_path / "plain").notes == ()
+
+    def keys(content: dict[str, Any]) -> None:
+        content.update(orientation_override="none", aabb_scale=16)
+        content["frames"][1].update(depth_file_path="depth/b.png", sharpness=9.5, colmap_im_id=2)
+
+    rewrite(tmp_path / "s", keys)
+    said = "transforms.json says aabb_scale, depth_file_path, orientation_override, which are not used"
+    assert load_scene(tmp_path / "s").notes == (said,)
+
+
+@pytest.mark.parametrize(("model", "key"), [("OPENCV_FISHEYE", "p1"), ("OPENCV_FISHEYE", "k5"), ("OPENCV", "k4")])
+def test_terms_of_distortion_that_a_lens_does_not_have_here_are_refused(tmp_path: Path, model: str, key: str) -> None:
+    rewrite(tmp_path / "s", lambda content: content["frames"][2].update({"camera_model": model, key: 0.01}))
+    with pytest.raises(InputError, match=f"got {key} for 'images/c.png'"):
+        load_scene(tmp_path / "s")
+
+
+def test_the_split_of_a_file_is_taken_whole_or_in_part(tmp_path: Path) -> None:
+    a, b, c = (f"images/{name}" for name in NAMES)
+    lists = {"train_filenames": [c, f"./{a}"], "val_filenames": [b.replace("/", "\\")]}
+    rewrite(tmp_path / "s", lambda content: content.update(lists))
+    scene = load_scene(tmp_path / "s")
+    assert split_scene(scene) == Split((a, c), (b,), "named") and usual_views(scene) == 2 and scene.notes == ()
+    assert split_scene(scene, 1).train == (a,)
+    rewrite(
+        tmp_path / "part", lambda content: content.update(train_filenames=[a], test_filenames=[b], val_filenames=[c])
+    )
+    assert split_scene(load_scene(tmp_path / "part")).test == (b,)
+    words = ["transforms.json says val_filenames, which is not used", "1 frames are in neither list", f"such as {c}"]
+    assert all(part in " ".join(load_scene(tmp_path / "part").notes) for part in words)
+
+
+@pytest.mark.parametrize(
+    ("lists", "message"),
+    [
+        ({"train_filenames": ["images/z.png"], "test_filenames": ["images/a.png"]}, "got 'images/z.png'"),
+        ({"train_filenames": ["images/a.png"], "test_filenames": ["images/a.png"]}, "which is in train_filenames too"),
+        ({"test_filenames": ["images/a.png"]}, "got train_filenames = None"),
+        ({"train_filenames": "images/a.png"}, "expected a list of file paths"),
+        ({"train_filenames": ["images/a.png"], "test_filenames": [1]}, "expected a list of file paths"),
+    ],
+)
+def test_lists_of_a_split_that_cannot_be_are_refused(tmp_path: Path, lists: dict[str, Any], message: str) -> None:
+    rewrite(tmp_path / "s", lambda content: content.update(lists))
+    with pytest.raises(InputError, match=message):
+        load_scene(tmp_path / "s")
+
+
+def test_files_from_windows_and_without_suffix_are_found(tmp_path: Path) -> None:
+    def names(content: dict[str, Any]) -> None:
+        for i, frame in enumerate(content["frames"]):
+            frame["file_path"] = ["images\\a.png", "images/b", "images/c.jpg"][i]
+            frame["mask_path"] = "more\\m.png"
+
+    rewrite(tmp_path / "s", names)
+    (tmp_path / "s/images/b.png").rename(tmp_path / "s/images/b.TIF")
+    folders.write_pictures(tmp_path / "s/more", ("m.png",))
+    content = (tmp_path / "s/transforms.json").read_bytes()
+    (tmp_path / "s/transforms.json").write_bytes(b"\xef\xbb\xbf" + content)  # as Windows marks UTF-8
+    scene = load_scene(tmp_path / "s")
+    assert scene.names == ("images/a.png", "images/b", "images/c.jpg")
+    assert [frame.path.name for frame in scene.frames if frame.path] == ["a.png", "b.TIF", "c.png"]
+    assert all("mask" in frame.layers for frame in scene.frames)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (np.diag([-1.0, 1, 1, 1]), "mirrors: its axes are left-handed"),
+        (np.diag([2.0, 2, 2, 1]), "scales by 2, has"),
+        (np.array([[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), r"has \|R R\^T - 1\| = 1\.0e-01"),
+    ],
+)
+def test_a_pose_that_is_no_rotation_is_refused_with_what_it_is(tmp_path: Path, change: np.ndarray, words: str) -> None:
+    def turned(content: dict[str, Any]) -> None:
+        content["frames"][0]["transform_matrix"] = (change @ np.eye(4)).tolist()
+
+    rewrite(tmp_path / "s", turned)
+    with pytest.raises(
+        InputError, match=rf"image 'images/a.png' cannot be: expected a rotation matrix, got one that {words}"
+    ):
+        load_scene(tmp_path / "s")

@@ -1,5 +1,6 @@
 """Points from the training views alone."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import torch
 from splat.scenes.scene import load_scene
 from splat.scenes.sfm.triangulation import triangulated_points
 from splat.scenes.splits import split_scene
-from splat.scenes.view import Points, View, pixel_coordinates
+from splat.scenes.view import Frame, Points, View, pixel_coordinates
 from tests.splat.scenes import textured
 
 SHARP = 1.0  # px within which nearly all features lie
@@ -23,7 +24,11 @@ def views() -> list[View]:
 
 @pytest.fixture(scope="module")
 def points(views: list[View]) -> Points:
-    return triangulated_points(views)
+    return triangulated_points(frames(views))
+
+
+def frames(views: Sequence[View]) -> list[Frame]:
+    return [Frame(view.name, view.camera, lambda camera, view=view: view) for view in views]
 
 
 def test_triangulated_points_lie_on_the_surface(points: Points) -> None:
@@ -50,11 +55,13 @@ def test_triangulated_points_have_the_colour_of_their_pixels(points: Points, vie
 
 
 def test_two_views_are_enough_to_triangulate_from(views: list[View]) -> None:
-    assert len(triangulated_points(views[:2])) > 30
+    assert len(triangulated_points(frames(views[:2]))) > 30
 
 
-def test_the_same_views_give_the_same_points(points: Points, views: list[View]) -> None:
-    again = triangulated_points(views)
+def test_the_same_photographs_give_the_same_points_however_they_are_reduced(points: Points, views: list[View]) -> None:
+    size = (textured.WIDTH, textured.HEIGHT)
+    quarter = [replace(f, camera=f.camera.resized(size[0] // 4, size[1] // 4), whole=size) for f in frames(views)]
+    again = triangulated_points(quarter)
     assert torch.equal(again.xyz, points.xyz) and torch.equal(again.rgb, points.rgb)
 
 
@@ -63,7 +70,7 @@ def test_the_log_of_colmap_stays_as_it_was(views: list[View]) -> None:
     pycolmap.logging.minloglevel = 1
     try:
         with pytest.raises(ValueError, match="none that match"):
-            triangulated_points([replace(view, image=torch.full_like(view.image, 0.5)) for view in views])
+            triangulated_points(frames([replace(view, image=torch.full_like(view.image, 0.5)) for view in views]))
         assert pycolmap.logging.minloglevel == 1
     finally:
         pycolmap.logging.minloglevel = before
@@ -71,7 +78,7 @@ def test_the_log_of_colmap_stays_as_it_was(views: list[View]) -> None:
 
 def test_one_view_cannot_be_triangulated(views: list[View]) -> None:
     with pytest.raises(ValueError, match="at least 2 views to triangulate from, got 1"):
-        triangulated_points(views[:1])
+        triangulated_points(frames(views[:1]))
 
 
 def test_fern_is_triangulated_from_three_views_without_the_others(fern: Path) -> None:

@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from landscape.errors import InputError
+from splat.model.files.splat_ply import splat_ply
 from splat.model.gaussians import Gaussians
 from splat.render.render import render
 from splat.scenes.scene import Scene, load_scene
@@ -15,7 +16,7 @@ from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import open_checkpoint
 from splat.training.origin.foreign import Foreign
-from splat.training.origin.frames import gsplat_frames, nerfstudio_frame, posed
+from splat.training.origin.frames import gsplat_frames, nerfstudio_frame, posed, shift_of, shift_to_origin
 from tests.splat.model.files import written
 
 MADE = synthetic_scene(SyntheticSettings(gaussians=60, views=8, width=24, height=16))
@@ -121,3 +122,72 @@ def test_a_file_that_is_no_similarity_is_refused(tmp_path, scene, content):
     (tmp_path / "dataparser_transforms.json").write_text(content)
     with pytest.raises(InputError, match="expected"):
         nerfstudio_frame(tmp_path / "a.ckpt", scene)
+
+
+def test_an_applied_scale_is_taken_back(tmp_path, scene):
+    rigid, applied = np.column_stack([TURN, [0.1, 0.2, 0.3]]), np.array([[1.0, 0, 0, 0.5], [0, 0, 1, 0], [0, -1, 0, 2]])
+    # nerfstudio saves scale x applied_scale, and transform x applied_transform
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps({"transform": rigid.tolist(), "scale": 0.25 * 3}))
+    file, point = tmp_path / "scene/transforms.json", np.array([0.3, -0.2, 1.7])
+    content = json.loads(file.read_text()) | {"applied_transform": applied.tolist()}
+    file.write_text(json.dumps({**content, "applied_scale": 3.0}))
+    found = nerfstudio_frame(tmp_path / "a.ckpt", scene)
+    np.testing.assert_allclose(found @ [*(applied @ [*point, 1]), 1], 0.25 * (rigid @ [*point, 1]), atol=1e-12)
+    for wrong in (0, "3", -1.0):
+        file.write_text(json.dumps({**content, "applied_scale": wrong}))
+        with pytest.raises(InputError, match="expected an applied_scale above 0"):
+            nerfstudio_frame(tmp_path / "a.ckpt", scene)
+
+
+def far(scene: Scene, away: tuple[float, float, float]) -> Scene:
+    return posed(scene, np.column_stack([np.eye(3), away]).tolist(), centred=False)
+
+
+@pytest.mark.parametrize("away", [(431000.0, 5412000.0, 300.0), (0.0, -1e4, 0.0), (1e9, 0.0, 0.0)])
+def test_a_world_far_from_its_origin_is_moved_back_without_rounding(away):
+    shift = shift_to_origin(far(MADE.scene, away))
+    assert shift is not None and shift_to_origin(MADE.scene) is None
+    assert (
+        np.array_equal(shift[:, 3].astype(np.float32), shift[:, 3])
+        and shift_of(shift.tolist()) == (-shift[:, 3]).tolist()
+    )
+    back = posed(far(MADE.scene, away), shift.tolist(), centred=False)
+    assert shift_to_origin(back) is None and back.points is not None and MADE.scene.points is not None
+    rounding = np.spacing(max(map(abs, away)))  # of the world in float64
+    moved = torch.from_numpy(np.array(away) + shift[:, 3])
+    for before, after in zip(MADE.scene.frames, back.frames, strict=True):
+        assert (after.camera.centre - before.camera.centre - moved).abs().max() <= rounding
+    assert (back.points.xyz - MADE.scene.points.xyz - moved).abs().max() <= rounding
+    (note,) = [note for note in back.notes if "float32" in note and shift_of(shift.tolist()) is not None][-1:]
+    assert f"{-shift[0, 3]:.9g}, {-shift[1, 3]:.9g}, {-shift[2, 3]:.9g}" in note
+
+
+def test_what_float32_rounds_decides_at_a_thousandth_of_a_pixel():
+    cameras = [frame.camera for frame in MADE.scene.frames]
+    centres = torch.stack([camera.centre for camera in cameras])
+    assert MADE.scene.points is not None
+    depth = float((centres - MADE.scene.points.xyz.median(dim=0).values).norm(dim=1).median())
+    limit = 1e-3 * depth / (2**-23 * cameras[0].fx)  # world units from the origin
+    beyond = float(centres.mean(dim=0).norm())
+    assert shift_to_origin(far(MADE.scene, (0.0, 0.0, limit + 2 * beyond))) is not None
+    assert shift_to_origin(far(MADE.scene, (0.0, 0.0, limit - 2 * beyond))) is None
+
+
+def test_only_a_pure_shift_is_one():
+    assert shift_of(None) is shift_of(MOVE.tolist()) is shift_of(np.diag([2.0, 2, 2, 1])[:3].tolist()) is None
+
+
+@pytest.mark.parametrize("exported_near", [True, False])
+def test_another_tools_gaussians_are_probed_near_the_origin(tmp_path, exported_near):
+    away = (4000.0, -60000.0, 300.0)
+    write_transforms_scene(far(MADE.scene, away), tmp_path / "scene")
+    shift = shift_to_origin(load_scene(tmp_path / "scene"))
+    assert shift is not None
+    near = carried(flat(), np.column_stack([np.eye(3), np.array(away) + shift[:, 3]]))
+    file = near if exported_near else carried(flat(), np.column_stack([np.eye(3), away]))
+    path = tmp_path / "a.ply"
+    path.write_bytes(splat_ply(file.to(torch.float32)))
+    found = open_checkpoint(path, Foreign(tmp_path / "scene", trained_by="gsplat-raw"), tmp_path / "mismatch.png")
+    assert found.scene.similarity == shift.tolist()
+    rounding = 1e-6 if exported_near else np.spacing(np.float32(60000))
+    assert (found.training.gaussians.means - near.means).abs().max() <= rounding
