@@ -6,7 +6,7 @@ from pathlib import Path
 
 from splat.model.typed import leaves
 from splat.scenes.scene import Scene
-from splat.scenes.view import View
+from splat.scenes.view import View, inside_image
 from splat.training.methods.second_order.steps import SecondOrder
 from splat.training.start import Source
 from splat.training.state import TrainConfig, Training
@@ -41,7 +41,7 @@ def remarks(
     """asked, config: the settings, not scaled and scaled, without what a checkpoint brings; begun: the start and its Gaussians,
     None where there is a checkpoint; view: one of those to train on."""
     found = [*scene.notes, begun and poor_start(scene, *begun), _scaled(asked, config), _not_reached(config)]
-    found += [*_of_second_order(config), removes_for_size(training, view)]
+    found += [*_of_second_order(config), removes_for_size(training, view), cut_by_near(training, view)]
     return [words for words in found if words]
 
 
@@ -64,6 +64,18 @@ def removes_for_size(training: Training, view: View) -> str:
         f"3DGS's rule for scenes seen from all around removes all Gaussians with a sigma above {largest:.3g}, here some "
         f"{pixels:.2g} px, in each round from step {rounds[0]:,} to {rounds[-1]:,}: the loss is high until then; "
         "--set densify.prune_scale=none keeps them"
+    )
+
+
+def cut_by_near(training: Training, view: View) -> str:
+    """Warning of Gaussians in a view's picture that are not drawn, for they are nearer than the near plane; else empty."""
+    near, means = training.config.render.near, training.gaussians.means.detach().double().cpu()
+    count = int(inside_image(view.camera, means, (0.0, near)).sum())
+    if not count:
+        return ""
+    return (
+        f"{count:,} of {len(means):,} Gaussians are nearer to {view.name} than the near plane at {near:g} world units, and not "
+        "drawn there: scale the scene, or lower it with --set render.near=X"
     )
 
 

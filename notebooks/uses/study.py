@@ -40,6 +40,7 @@ from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import split_scene
 from splat.scenes.view import View
 from splat.training.loop import train
+from splat.training.origin.frames import posed, shift_to_origin
 from splat.training.score.evaluate import evaluate
 from splat.training.start import initial_gaussians
 from splat.training.state import TrainConfig, Training
@@ -100,6 +101,8 @@ def run_study(file: Path) -> int:
         found = _kept(path, told)
         if found is None:
             scene = load_scene(file.parent / study.scenes[name].path, downscale=study.scenes[name].downscale)
+            shift = shift_to_origin(scene)
+            scene = posed(scene, None if shift is None else shift.tolist(), centred=False)
             found = [{"scene": name, "rule": rule, "seed": seed, **row} for row in cell(scene, study, rule, seed)]
             write_atomically(path, json_text({"told": told, "rows": found}).encode())
         rows += found

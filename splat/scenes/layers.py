@@ -118,7 +118,7 @@ def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
         if file.has_transparency_data and low.min() == low.max():
             low, high = _range_of_colours(file, alpha=False)
     white = int(high.max())
-    if not white:
+    if white <= 0:
         raise InputError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
     between = float((low < UNCLEAR[1] * white)[(high > UNCLEAR[0] * white)].mean())
     if between > MOST_UNCLEAR or 1 < white <= MOST_LABELS:

@@ -99,7 +99,7 @@ def _skipped(names: Sequence[str], there: int) -> list[str]:
 def _unused(data: Mapping[str, Any], name: str) -> list[str]:
     """A note on what a file says beside what is read."""
     unused = {key for part in (data, *data["frames"]) for key in part} - USED - NO_MATTER
-    if "test_filenames" in data and {*data.get("val_filenames", ())} - {*data["test_filenames"]}:
+    if "test_filenames" in data and data.get("val_filenames", data["test_filenames"]) != data["test_filenames"]:
         unused.add("val_filenames")
     words = ", ".join(key if key.isprintable() else repr(key) for key in sorted(unused))
     return [f"{name} says {words}, which {'is' if len(unused) == 1 else 'are'} not used"] if unused else []

@@ -15,6 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from analysis.commands.cli import main
+from analysis.commands.convert import own_file
 from analysis.console.overrides import overridden
 from analysis.records.records import read_record
 from analysis.train.command import planned
@@ -24,6 +25,7 @@ from analysis.train.remarks import (
     HOW_TO_START,
     _not_reached,
     _of_second_order,
+    cut_by_near,
     poor_start,
     removes_for_size,
 )
@@ -32,11 +34,12 @@ from splat.losses.reference import LossSettings
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from splat.training.checkpoint import load_checkpoint
+from splat.training.checkpoint import Checkpoint, load_checkpoint
 from splat.training.densify import DensifySettings
 from splat.training.methods.corgs import CoRGS
 from splat.training.methods.second_order.gn_cg import GaussNewtonCG
 from splat.training.methods.stablegs.stablegs import StableGS
+from splat.training.origin.frames import posed, shift_in_words, shift_of
 from splat.training.start import Source
 from splat.training.state import TrainConfig, Training
 from tests.splat.tiny import tiny_gaussians, tiny_views
@@ -126,6 +129,34 @@ def test_a_rule_that_removes_what_is_small_in_the_image_is_said(extent, changes,
     near = replace(view, camera=replace(view.camera, fx=30.0))
     found = removes_for_size(Training.start(gaussians, extent, config), near)
     assert said in found and bool(found) == bool(said)
+
+
+def test_gaussians_nearer_than_the_near_plane_are_counted():
+    training, (view, *_) = Training.start(tiny_gaussians(), 1.0, TrainConfig()), tiny_views()
+    assert cut_by_near(training, view) == ""
+    training.gaussians.means[:2] = view.camera.centre + 0.1 * view.camera.forward
+    said = f"2 of {len(training.gaussians)} Gaussians are nearer to {view.name} than the near plane at 0.2 world units"
+    assert cut_by_near(training, view).startswith(said)
+
+
+def test_a_world_far_from_its_origin_is_planned_near_it_and_loaded_again_as_it_was(original, tmp_path):
+    made, away = load_scene(original), (431000.0, 5412000.0, 300.0)
+    away_from = posed(made, np.column_stack([np.eye(3), away]).tolist(), centred=False)
+    write_transforms_scene(away_from, tmp_path / "far")
+    scene, split, config, reference = planned(TrainOptions(tmp_path / "far", views=2), tmp_path / "run")
+    shift = shift_of(reference.similarity)
+    assert shift is not None and "the world is moved by -(431000" in scene.notes[-1]
+    rounding = np.spacing(5412000.0)
+    loaded = reference.load(tmp_path / "run/checkpoint.pt", config.background)
+    for plain, far, again in zip(made.frames, scene.frames, loaded.frames, strict=True):
+        moved = plain.camera.centre.numpy() + np.array(away) - np.array(shift)
+        assert np.abs(far.camera.centre.numpy() - moved).max() <= rounding
+        assert torch.equal(far.camera.centre, again.camera.centre)
+    assert scene.points is not None and scene.points.xyz.abs().max() < 100
+    training = Training.start(tiny_gaussians(), 1.0, config)
+    file, seen = own_file(Checkpoint(training, reference))
+    assert file.notes == (shift_in_words(shift),) and not seen.moved and split.train
+    assert planned(TrainOptions(original, views=2), tmp_path / "run")[3].similarity is None
 
 
 def test_without_lpips_the_metric_is_left_out_in_one_sentence_and_null_in_the_record(
