@@ -189,15 +189,14 @@ def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig
         options.scene, options.images, options.downscale, colour, options.masks, options.depths,
         strict_frames=options.strict_frames,
     )  # fmt: skip
-    shift = None if options.from_ else shift_to_origin(scene)  # a checkpoint brings its world
-    world = None if shift is None else shift.tolist()
-    scene = posed(scene, world, centred=False)
     split = _split(options, scene)
     start = typed(Source, options.start or preset.get("start", "scene"), "start")
     reference = SceneReference.to(
         scene, out / CHECKPOINT, split, options.images, options.downscale, start, options.depths, options.masks
     )
-    return scene, split, _config(options, scene), replace(reference, similarity=world)
+    shift = None if options.from_ else shift_to_origin(scene)  # a checkpoint brings its world
+    world = None if shift is None else shift.tolist()
+    return posed(scene, world, centred=False), split, _config(options, scene), replace(reference, similarity=world)
 
 
 def _split(options: TrainOptions, scene: Scene) -> Split:

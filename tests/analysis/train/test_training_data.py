@@ -147,13 +147,13 @@ def test_a_world_far_from_its_origin_is_planned_near_it_and_loaded_again_as_it_w
     shift = shift_of(reference.similarity)
     assert shift is not None and "the world is moved by -(431000" in scene.notes[-1]
     rounding = np.spacing(5412000.0)
-    loaded = reference.load(tmp_path / "run/checkpoint.pt", config.background)
+    training = Training.start(tiny_gaussians(), 1.0, config)
+    _, loaded = Checkpoint(training, reference).load_scene(tmp_path / "run/checkpoint.pt")
     for plain, far, again in zip(made.frames, scene.frames, loaded.frames, strict=True):
         moved = plain.camera.centre.numpy() + np.array(away) - np.array(shift)
         assert np.abs(far.camera.centre.numpy() - moved).max() <= rounding
         assert torch.equal(far.camera.centre, again.camera.centre)
     assert scene.points is not None and scene.points.xyz.abs().max() < 100
-    training = Training.start(tiny_gaussians(), 1.0, config)
     file, seen = own_file(Checkpoint(training, reference))
     assert file.notes == (shift_in_words(shift),) and not seen.moved and split.train
     assert planned(TrainOptions(original, views=2), tmp_path / "run")[3].similarity is None
