@@ -67,8 +67,8 @@ class Frame:
     picture: reads it for a camera, at that camera's size.  subset: the part that the scene's own files assign it to.
     depth_range: nearest and farthest depth of the scene content, world units.  None where the files do not say.  path: of the
     picture, None where it is not on disk.  layers: which of alpha, mask and depth its view has; mask, depth: the files.
-    distortion: model and parameters of its lens, where that was no pinhole.  whole: (width, height) of the photograph, px, before
-    it is reduced; None: that of the camera.
+    distortion: model and parameters of its lens, where that was no pinhole.  whole: (width, height) of the photograph, px,
+    before it is reduced; None: that of the camera.
     """
 
     name: str

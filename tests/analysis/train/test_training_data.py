@@ -148,7 +148,7 @@ def test_a_world_far_from_its_origin_is_planned_near_it_and_loaded_again_as_it_w
     assert shift is not None and "the world is moved by -(431000" in scene.notes[-1]
     rounding = np.spacing(5412000.0)
     training = Training.start(tiny_gaussians(), 1.0, config)
-    _, loaded = Checkpoint(training, reference).load_scene(tmp_path / "run/checkpoint.pt")
+    loaded = Checkpoint(training, reference).load_scene(tmp_path / "run/checkpoint.pt")
     for plain, far, again in zip(made.frames, scene.frames, loaded.frames, strict=True):
         moved = plain.camera.centre.numpy() + np.array(away) - np.array(shift)
         assert np.abs(far.camera.centre.numpy() - moved).max() <= rounding
