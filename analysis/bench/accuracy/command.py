@@ -272,7 +272,6 @@ def run_accuracy(checkpoint: Path, out: Path, downscale: float, seeds: int) -> i
     """Run every method with every seed; print, write and draw the results; returns the exit code 0."""
     console, errors = Console(), Console(stderr=True)
     out.mkdir(parents=True, exist_ok=True)
-    say("the truth first, a long run", console=errors)
     case = checkpoint_case(checkpoint, out, downscale)
     jobs = [(method, seed) for method in scene_methods() if method.applies(case) for seed in range(seeds)]
     shown = track(jobs, "accuracy", console=errors, transient=True)
