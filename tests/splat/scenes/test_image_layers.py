@@ -106,8 +106,8 @@ def test_masks_that_cannot_be_are_refused(tmp_path: Path, pixels: np.ndarray, me
         load_scene(tmp_path, downscale=2).load()
 
 
-def inside(path: Path, image: Image.Image, **save: int) -> np.ndarray:
-    image.save(path, **save)
+def inside(path: Path, image: Image.Image, quality: int = 75) -> np.ndarray:
+    image.save(path, quality=quality)
     return read_mask(path)[0].numpy() == 1
 
 

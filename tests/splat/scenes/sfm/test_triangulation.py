@@ -84,7 +84,7 @@ def test_one_view_cannot_be_triangulated(views: list[View]) -> None:
 def test_fern_is_triangulated_from_three_views_without_the_others(fern: Path) -> None:
     scene = load_scene(fern, downscale=4)
     chosen = scene.load(split_scene(scene, 3).train)
-    points, model = triangulated_points(chosen), scene.points
+    points, model = triangulated_points(frames(chosen)), scene.points
     assert model is not None and len(points) > 30
     # on the whole as far away as the points that all twenty photographs gave
     depth, known = (pixel_coordinates(chosen[1].camera, p.xyz)[1] for p in (points, model))
