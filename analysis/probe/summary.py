@@ -3,7 +3,7 @@
 from itertools import pairwise
 from pathlib import Path
 
-from analysis.records.findings import Line, findings, is_open
+from analysis.records.findings import Line, findings, is_loose
 from analysis.records.quantities import UNDETERMINED, apart, limits, measured, quantity
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import Index, Trace
@@ -58,7 +58,7 @@ def _index(data: ProbeRecord) -> str:
     """The first of the literal index and what stands for it that is known, with its bracket."""
     for name, words in (("literal", "λ max / λ min"), ("share", "share of λ max in all curvature")):
         index: Index | None = getattr(data.anisotropy, name) or None
-        if index and not is_open(index) and index.low is not None and index.high is not None:
+        if index and not is_loose(index) and index.low is not None and index.high is not None:
             low, high = limits(index.low, index.high)
             error = max(index.high - (index.value or 0.0), (index.value or 0.0) - index.low)
             narrow = error < 0.1 * abs(index.value or 0.0)

@@ -188,7 +188,7 @@ def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
 def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
     lines, saddle, share = [], family.saddle, family.share
     text = "The steepest direction up is {} times as curved as the steepest down{}."
-    if saddle and _is_finite(saddle.value) and not is_open(saddle):
+    if saddle and _is_finite(saddle.value) and not is_loose(saddle):
         lines.append(Line(text.format(quantity(saddle.value), _bracket(saddle))))
     elif saddle and saddle.low is not None and 0 < saddle.low < math.inf:
         lines.append(Line(text.format(f"at least {quantity(saddle.low)}", _in_brackets(saddle.note))))
@@ -298,7 +298,7 @@ def _of_depth(depth: schema.Depth | None) -> list[Line]:
     if _is_finite(depth.gradient_ratio):
         text = f"In depth, along the rays, the gradient of the positions is {quantity(depth.gradient_ratio)} times"
         text += " what it is in a direction across them (root mean square; the paper says about 100)"
-        if _is_finite(ratio.value):
+        if _is_finite(ratio.value) and not is_loose(ratio):
             text += f", and their curvature {quantity(ratio.value)} times{_bracket(ratio)}"
         lines.append(Line(f"{text}."))
     if rises := [row for row in depth.rises if _is_finite(row.ratio)]:

@@ -75,6 +75,11 @@ def sentences(data, level=None):
     return " | ".join(line.text for line in findings(probe_of(data)) if level in {None, line.level})
 
 
+def estimated(value: float, error: float) -> dict[str, float]:
+    """Another value of a trace, and its interval."""
+    return {"value": value, "standard_error": error, "low": value - 2 * error, "high": value + 2 * error}
+
+
 def test_the_page_fetches_nothing_and_carries_its_pictures(tmp_path):
     text = page(tmp_path / "probe", *synthetic(), picture="traces")
     parsed = Page(text)
@@ -327,17 +332,17 @@ def test_records_of_extreme_size_and_without_numbers_make_a_page(tmp_path, scale
 def test_the_findings_names_the_attribute_that_carries_the_curvature():
     data, _ = synthetic()
     assert "Position carries most of the curvature" in sentences(data) and "98%" in sentences(data)
-    data["traces"]["quats"] |= {"value": -3.9e5, "standard_error": 4e4}
+    data["traces"]["quats"] |= estimated(-3.9e5, 4e4)
     assert "Its error does not separate it from rotation" in sentences(data)
-    data["traces"]["quats"] |= {"value": -8e5, "standard_error": 4e3}
+    data["traces"]["quats"] |= estimated(-8e5, 4e3)
     assert "Rotation carries most" in sentences(data) and "separate" not in sentences(data)
 
 
 def test_most_is_over_half_and_what_the_error_does_not_separate_is_named():
     data, _ = synthetic()
-    data["traces"]["means"] |= {"value": 4.1e5, "standard_error": 1e4}
-    data["traces"]["quats"] |= {"value": 4e5, "standard_error": 4e4}
-    data["traces"]["sh"] |= {"value": -3.8e5, "standard_error": 4e4}
+    data["traces"]["means"] |= estimated(4.1e5, 1e4)
+    data["traces"]["quats"] |= estimated(4e5, 4e4)
+    data["traces"]["sh"] |= estimated(-3.8e5, 4e4)
     said = sentences(data)
     assert "Position carries the largest part of the curvature" in said and "carries most" not in said
     assert "does not separate it from rotation and colour (SH)." in said
@@ -466,7 +471,7 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     tmp_path, index, settings, reason, command
 ):
     data, arrays = synthetic()
-    data["anisotropy"][index] = {"value": 361.25, "low": 0.5, "high": None, "note": "open"}
+    data["anisotropy"][index] = {"value": 0.7777, "low": 0.5, "high": None, "note": "open"}
     data["eigenvalues"]["min"] |= {"reason": reason, "matvecs": 15}
     asked = {f"settings.{name}": value for name, value in settings.items()}
     data["provenance"] |= {"fingerprint": plain(Fingerprint({}, asked, "00"))}
@@ -475,10 +480,10 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     assert line.text.startswith(f"{index.replace('_', ' ').capitalize()}: – (at least 0.500); ")
     assert line.text.endswith(f"{command}." if command else "no more products resolve it.")
     text = Page(page(tmp_path / "probe", data, arrays)).text
-    assert "361" not in text and "0.500" in text
+    assert "77" not in text and "0.500" in text
     console = Console(width=120, file=StringIO())
     console.print(probe_table(probe_of(data), 120))
-    assert "361" not in console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+    assert "77" not in console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution(tmp_path):
@@ -488,6 +493,9 @@ def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution
     assert line.level == "caution" and "– (between 15.0 and 151)" in line.text
     text = Page(page(tmp_path / "probe", data, arrays)).text
     assert "97.3" not in text
+    data["anisotropy"]["literal"] = {"value": -97.31, "low": -151.0, "high": -15.0, "note": ""}
+    data["depth"] = depth_section() | {"curvature_ratio": {"value": 97.31, "low": 15.0, "high": 151.0, "note": ""}}
+    assert "97.3" not in sentences(data) and "97.3" not in " ".join(summary(probe_of(data), Path()))
     data["anisotropy"]["saddle"]["high"] = 149.0
     assert not any(line.text.startswith("Saddle") for line in findings(probe_of(data)))
 
