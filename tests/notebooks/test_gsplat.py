@@ -12,7 +12,7 @@ from splat.render.backend import backend_of
 
 
 def test_gsplat_is_given_the_same_view_and_the_same_loss(monkeypatch):
-    workload, seen = synthetic_workload(Size(4, 16, 12)), {}
+    workload, seen = synthetic_workload(Size(50, 16, 12)), {}
 
     def rasterization(means, quats, scales, opacities, colours, poses, lenses, width, height, **more):
         seen.update(more, poses=poses, lenses=lenses, size=(width, height), scales=scales)
@@ -24,9 +24,10 @@ def test_gsplat_is_given_the_same_view_and_the_same_loss(monkeypatch):
     view = workload.views[0]
     loss = backend_of(workload.gaussians.flat).view_loss(view.image, workload.loss, workload.gaussians.flat)
     gsplat_gradient(workload, view, loss)()
-    homogeneous = torch.cat([workload.gaussians.means, torch.ones(4, 1)], dim=1) @ seen["poses"][0].T
+    means = workload.gaussians.means
+    homogeneous = torch.cat([means, torch.ones(len(means), 1)], dim=1) @ seen["poses"][0].T
     camera = view.camera
-    offset = (workload.gaussians.means.double() - camera.centre) @ camera.rotation.double().T
+    offset = (means.double() - camera.centre) @ camera.rotation.double().T
     assert torch.allclose(homogeneous[:, :3].double(), offset, atol=1e-5)
     assert seen["size"] == (16, 12) and seen["lenses"][0, 0, 0] == pytest.approx(camera.fx)
     assert torch.equal(seen["scales"], workload.gaussians.log_scales.exp())

@@ -10,7 +10,7 @@ from splat.scenes.write import write_transforms_scene
 
 
 def test_estimators_are_compared_with_a_long_run_on_ones_own_scene(tmp_path, monkeypatch, capsys):
-    made = synthetic_scene(SyntheticSettings(gaussians=40, views=4, width=16, height=12, sh_degree=0))
+    made = synthetic_scene(SyntheticSettings(gaussians=50, views=4, width=16, height=12, sh_degree=0))
     write_transforms_scene(made.scene, tmp_path / "scene")
     words = ["--views", "2", "--iterations", "2", "--sh-degree", "0", "--out", str(tmp_path / "run")]
     assert main(["train", str(tmp_path / "scene"), *words]) == 0
