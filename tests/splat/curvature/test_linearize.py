@@ -205,7 +205,7 @@ def test_what_a_product_takes_is_free_before_its_result_is_made():
 
 
 def test_gaussians_vectors_and_images_of_another_dtype_are_refused():
-    gaussians, views = random_gaussians(8, sh_degree=1, seed=4), two_views()
+    gaussians, views = random_gaussians(8, sh_degree=1, seed=4).to(torch.float32), two_views()
     objective = SceneObjective(gaussians, views, LossSettings(), BACKGROUND.float())
     double = objective.active.to(torch.float64)
     view = objective.linearizer(objective.active)(0)

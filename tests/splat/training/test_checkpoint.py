@@ -213,7 +213,7 @@ def test_a_file_that_would_run_code_is_refused_and_runs_nothing(tmp_path):
 
 CHANGES = {
     "format": ("something else", "does not hold the format"),
-    "version": (1, "format version is 1, this program reads 2 alone"),
+    "version": (1, f"format version is 1, this program reads {VERSION}"),
     "torch": (2, "'torch': expected str, got int"),
     "step": (1000, "step 1000 is not among its 12"),
     "extent": (1e300, "extent is 1e.300"),
@@ -266,7 +266,11 @@ def test_a_ply_file_is_refused_by_its_name(tmp_path):
         ("iterations", "many", "'config.iterations': expected int, got str"),
         ("background", (0.0, 1.0), "'config.background': expected array of length 3, got 2"),
         ("seed", -1, "'config.seed': expected int >= 0, got -1"),
-        ("loss", {"pixel": "l1"}, "'config' has missing or unknown keys: loss.eps, loss.literal, loss.ssim_weight"),
+        (
+            "loss",
+            {"pixel": "l1"},
+            "missing or unknown keys: loss.border, loss.eps, loss.literal, loss.opacity_reg, loss.scale_reg",
+        ),
         ("method", {"name": "magic"}, "'config.method' has the unknown name 'magic'"),
         ("method", {"name": "stablegs"}, "'config' has missing or unknown keys: method.accuracy"),
         ("method", "3dgs", "'config.method': expected object, got str"),

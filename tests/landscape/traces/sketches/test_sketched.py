@@ -199,7 +199,7 @@ def test_a_time_budget_holds_for_every_task_of_a_method(method, monkeypatch):
             seconds[0] += V.shape[1]
             return super().apply(V)
 
-    for module in ("trace", "hutchinson", "sketched"):
+    for module in ("trace", "hutchinson", "sketches.sketched"):
         monkeypatch.setattr(f"landscape.traces.{module}.monotonic", lambda: seconds[0])
     settings = TraceSettings(rtol=1e-6, max_probes=300, max_seconds=40, method=method)
     estimate = estimate_traces(Timed(matrix), generator(), settings)["all"]

@@ -174,10 +174,9 @@ def test_without_a_gaussian_in_sight_a_diagnosis_keeps_the_magnitudes():
     training = Training.start(tiny_gaussians(), EXTENT, config)
     method, kept = training.method, []
     assert isinstance(method, stablegs.StableGSMethod)
-    looking_away(training.gaussians)
     for done in train(training, tiny_views()):
         kept.append(dict(method.magnitudes))
-        if done.step in (4, 6):  # in sight for the steps 5 and 6, with the diagnosis of step 5
+        if done.step in (2, 4, 6):  # out of sight for the diagnoses of steps 3 and 7, in sight for that of step 5
             looking_away(training.gaussians)
     assert not any(kept[:4]) and kept[4] and all(magnitudes == kept[4] for magnitudes in kept[4:])
     found = {row["step"]: row.get("note", "") for row in method.history if "count" not in row}
