@@ -8,6 +8,7 @@ import json
 import math
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,7 +34,7 @@ def read_json(path: Path, kind: type[T], what: str, remedy: str) -> T:
 
 def plain_json(path: Path, what: str, remedy: str) -> Any:
     """A file's content as plain types.  InputError where it is no JSON."""
-    return decoded(with_remedy(f"it should be {what}; {remedy}", untrusted.read_json, path))
+    return decoded(with_remedy(remedy, partial(untrusted.read_json, what=what), path))
 
 
 def with_remedy(remedy: str, read: Callable[[Path], T], path: Path) -> T:

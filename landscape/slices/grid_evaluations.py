@@ -138,6 +138,8 @@ class GridEvaluations:
         if not archive:
             return {}
         try:
+            if missing := {"digest", "center_loss", "has_signature", *COLUMNS} - archive.keys():
+                raise ValueError(f"no {', '.join(sorted(missing))}")
             digest, center_loss = str(archive["digest"]), float(archive["center_loss"])
             has_pieces = bool(archive["has_signature"])
             columns = [archive[name] for name in COLUMNS]
@@ -147,8 +149,10 @@ class GridEvaluations:
                 )
             points, values, crossed = (each.tolist() for each in columns)
             stored = dict(zip(points, zip(values, crossed, strict=True), strict=True))
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"expected a slice's evaluations in {store}, got others ({error}); {advice}") from None
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"expected a slice's evaluations in {store}, got a damaged file ({error}); {advice}"
+            ) from None
         if digest != self._digest:
             raise InputError(
                 f"expected evaluations of this slice in {self._store}, got another center, other directions or "

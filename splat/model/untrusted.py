@@ -13,7 +13,6 @@ import os
 import re
 import shutil
 import tomllib
-import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -36,6 +35,7 @@ LFS_MAGIC = b"version https://git-lfs"
 SLACK = 2**20  # bytes that any archive may hold
 FOLDER = 0x10  # among the attributes of a member
 MOST_TEXT = 2**28  # bytes of a file of text
+DEEPEST = 64  # levels of lists and mappings in one; records have at most ten, and Python takes about 300
 MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
 NAME = r"^[\w+-][\w.+ -]{0,99}$"  # of a file in a record, or that becomes a folder: letters, digits, - _ + . and blanks
 LONGEST = 200  # bytes of a name to which more may be added
@@ -108,9 +108,19 @@ def _refusing(what: str, path: Path) -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:
-        if isinstance(error, OSError) and error.errno is not None:
+        if is_of_the_system(error):
             raise
         raise InputError(f"expected {what} in {path}, got a damaged file ({error})") from None
+
+
+def is_of_the_system(error: BaseException) -> bool:
+    """Whether the file system, rather than what a file holds, is the cause.
+
+    >>> is_of_the_system(FileNotFoundError(2, "gone")), is_of_the_system(OSError("no picture"))
+    (True, False)
+    """
+    # a damaged index of an archive leads to before its start, where no file system goes
+    return isinstance(error, OSError) and error.errno not in (None, errno.EINVAL)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -140,10 +150,21 @@ def _bytes(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def read_json(path: Path) -> Any:
-    """Content of strict JSON as plain types.  InputError where it is none."""
-    with _refusing("JSON", path):
-        return msgspec.json.decode(_bytes(path))
+def read_json(path: Path, what: str = "JSON") -> Any:
+    """Content of strict JSON as plain types.  InputError, which says what was expected, where it is none or too deep."""
+    with _refusing(what, path):
+        return _shallow(msgspec.json.decode(_bytes(path)))
+
+
+def _shallow(content: Any) -> Any:
+    """The content, which no function that calls itself for each level can fail on."""
+    level = [content]
+    for _ in range(DEEPEST):
+        inside = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
+        level = [each for members in inside for each in members]
+    if level:
+        raise InputError(f"more than {DEEPEST} levels")
+    return content
 
 
 def loose_json(content: str | bytes, parse_int: Callable[[str], Any] | None = None) -> Any:
@@ -154,19 +175,15 @@ def loose_json(content: str | bytes, parse_int: Callable[[str], Any] | None = No
         raise InputError(f"no JSON ({error})") from None
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """InputError where it is none."""
-    with _refusing("TOML", path):
-        return tomllib.loads(_bytes(path).decode("utf-8"))
+def read_toml(path: Path, what: str = "TOML") -> dict[str, Any]:
+    """As `read_json`."""
+    with _refusing(what, path):
+        return _shallow(tomllib.loads(_bytes(path).decode("utf-8")))
 
 
 def read_picture(path: Path) -> Image.Image:
     """A PNG or JPEG.  InputError where it is none, or has more than MOST_PIXELS."""
-    with (
-        _refusing("a picture", path),
-        warnings.catch_warnings(action="error"),
-        Image.open(path, formats=("PNG", "JPEG")) as image,
-    ):
+    with _refusing("a picture", path), Image.open(path, formats=("PNG", "JPEG")) as image:
         if image.width * image.height > MOST_PIXELS:
             raise InputError(f"{image.width} x {image.height} pixels, of at most {MOST_PIXELS:,}")
         image.load()

@@ -5,7 +5,6 @@ is written atomically, and loaded with `weights_only=True`, so that nothing in i
 which torch omits.  The same training gives the same bytes.
 """
 
-import errno
 import io
 import json
 import sys
@@ -26,7 +25,7 @@ from splat.losses.reference import LossSettings
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.typed import MOST, Count, leaves, typed
-from splat.model.untrusted import loose_json, require_content, require_whole, write_atomically
+from splat.model.untrusted import is_of_the_system, loose_json, require_content, require_whole, write_atomically
 from splat.scenes.scene import Scene
 from splat.scenes.splits import spread_views
 from splat.training.adam import Adam
@@ -284,8 +283,7 @@ def _read(file: BinaryIO, path: Path) -> Any:
         with warnings.catch_warnings(action="ignore"):  # torch warns of other kinds of pickle before it refuses them
             return torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # files of other kinds fail in torch with errors of many kinds
-        bad_seek = isinstance(error, OSError) and error.errno == errno.EINVAL  # caused by a damaged index
-        if lacks_memory(error) or (isinstance(error, OSError) and not bad_seek):
+        if lacks_memory(error) or is_of_the_system(error):
             raise
         runs = [folder for folder in path.absolute().parents[:2] if (folder / "checkpoint.pt").is_file()]
         if runs and path.name != "checkpoint.pt" and not zipfile.is_zipfile(path):

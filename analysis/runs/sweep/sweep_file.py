@@ -98,8 +98,9 @@ def read_sweep(file: Path, out: Path | None = None, probe: bool = False) -> Swee
         raise FileNotFoundError(
             f"expected a sweep in TOML at {file}, found no such file; landscape sweep --help has an example"
         )
+    content = read_toml(file, "a sweep in TOML")
     try:
-        return _sweep(read_toml(file), file, out, probe)
+        return _sweep(content, file, out, probe)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
 

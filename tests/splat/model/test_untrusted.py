@@ -91,6 +91,7 @@ def test_names_that_are_not_fit_for_a_file_or_folder_are_refused(name):
     [
         (read_json, b"[" * 5000), (read_json, b"{"), (read_json, b'"\xff"'), (read_toml, b"a = " + b"[" * 5000),
         (read_toml, b"a = " + b"9" * 6000), (read_toml, b"\xff"), (read_picture, b"GIF89a"), (read_picture, b""),
+        (read_json, b"[" * 65 + b"]" * 65), (read_toml, b"a = " + b"[" * 64 + b"]" * 64),
         (read_arrays, b"PK"), (read_arrays, b"not an archive"),
     ],
 )  # fmt: skip
