@@ -173,6 +173,14 @@ class Shade(Struct, frozen=True, kw_only=True):
     high: float
     soft: float = 1.0
 
+    def __post_init__(self) -> None:
+        try:
+            ends = [self.value(self.low), self.value(self.high)]
+        except OverflowError:
+            ends = [math.inf]
+        if not (np.isfinite(ends).all() and self.low <= self.high):
+            raise ValueError(f"Expected a scale between numbers, got one from {self.low} to {self.high}")
+
     @classmethod
     def of(
         cls,
