@@ -130,9 +130,11 @@ class Records(Format):
     def write(self) -> None:
         from tests.analysis.runs.test_compare import record
 
-        record(self.root / "probe", 1.0)
         self.second = self.root / "other"
-        record(self.second / "probe", 0.5)
+        self.second.mkdir()
+        for run, scale in ((self.root, 1.0), (self.second, 0.5)):
+            save_checkpoint(run / "checkpoint.pt", tiny_training(), REFERENCE)
+            record(run / "probe", scale)
         self.checkpoint = Checkpoint(tiny_training(), REFERENCE)
         self.by_bytes = False
 

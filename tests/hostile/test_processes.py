@@ -71,7 +71,7 @@ def test_what_a_signal_ends_keeps_what_it_found_and_goes_on_from_there(run, tmp_
     out = tmp_path / "record"
     command = [words[0], str(run / "checkpoint.pt"), "--out", str(out), *words[1:]]
     process = started(command)
-    waits_for(lambda: any((tmp_path / ".record.unfinished").glob("[!.]*.[mn]*")), process)
+    waits_for(lambda: any((tmp_path / ".record.unfinished").rglob("[!.]*.[mn]*")), process)
     process.terminate()
     said = process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == 143 and said.endswith("landscape: interrupted by SIGTERM\n"), said

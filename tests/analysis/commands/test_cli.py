@@ -362,7 +362,7 @@ def test_help_says_what_an_option_that_is_left_out_stands_for(command, capsys):
 def test_what_the_system_refuses_is_said_with_the_path(original, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(arguments(original, tmp_path / "file" / "run")) == 2
-    one_sentence(capsys, f"landscape: cannot use {tmp_path / 'file'}", ": Not a directory")
+    one_sentence(capsys, f"landscape: cannot write in {tmp_path / 'file'}: Not a directory; choose another --out")
 
 
 def test_a_process_prints_everything_and_ends_with_its_exit_code():
