@@ -217,7 +217,7 @@ def test_the_record_and_the_page_hold_every_family_and_what_the_split_does(recor
     assert starts == rows[-1].starts and nodes >= rows[-1].steps
     page = Tables((record.folder / "report.html").read_text(encoding="utf-8"))
     lines = page.rows("families")
-    assert len(lines) == 1 + 3 * 12 and all(len(line) == len(lines[0]) == 12 for line in lines)
+    assert len(lines) == 1 + 3 * 12 and all(len(line) == len(lines[0]) == 7 + len(INDICES) for line in lines)
     assert sum("×" in line[7 + 2] for line in lines if line[2] == "changes by") == 12  # the share
     assert split.unit in page.text
 
