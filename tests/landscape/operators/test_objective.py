@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.utils.checkpoint import checkpoint
 
 from landscape.errors import InputError
 from landscape.operators.objective import ObjectiveHessian
@@ -15,6 +16,7 @@ POINT = torch.tensor([0.3, -0.7, 1.1, 0.4, 2.0], dtype=torch.float64)
 
 def test_it_is_the_dense_hessian_of_autograd():
     dense = torch.autograd.functional.hessian(loss, POINT)
+    assert isinstance(dense, torch.Tensor)
     H = ObjectiveHessian(loss, POINT)
     assert torch.allclose(H.apply(torch.eye(5, dtype=torch.float64)), dense, rtol=0, atol=1e-14)
 
@@ -120,7 +122,7 @@ class Averaging(torch.nn.Module):
         self.register_buffer("calls", torch.zeros((), dtype=torch.long))
 
     def forward(self, x):
-        self.size.mul_(0.9).add_(0.1 * x.detach().norm())
+        self.size.mul_(0.9).add_(0.1 * x.detach().norm())  # pyright: ignore
         self.calls += 1
         return self.weight**2 * x / self.size
 
@@ -181,7 +183,7 @@ def test_samples_weigh_alike_however_they_are_cut_or_batches_by_request():
     batches = ObjectiveHessian.of_module(net, MSE, cuts, alike="batches")
     torch.testing.assert_close(batches.apply(eye), (parts[0] + parts[1]) / 2, rtol=1e-12, atol=1e-14)
     with pytest.raises(InputError, match=r"a row for each sample .*alike='batches'"):
-        ObjectiveHessian.of_module(net, lambda out, label: (out**2).mean(), [(x, "label")])
+        ObjectiveHessian.of_module(net, lambda out, label: (out**2).mean(), [(x, "label")])  # pyright: ignore
 
 
 def test_graphs_that_leave_too_little_memory_are_built_anew(monkeypatch):
@@ -225,7 +227,7 @@ KINDS = {
 def test_parameters_of_other_kinds_are_refused(kind):
     point, sentence = KINDS[kind]
     with pytest.raises(InputError, match=sentence):
-        ObjectiveHessian(lambda parts: sum((part**2).sum() for part in parts.values()), point)
+        ObjectiveHessian(lambda parts: sum((part**2).sum() for part in parts.values()), point)  # pyright: ignore
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.complex64])
@@ -260,7 +262,7 @@ MEASURED = {
     "attention": torch.nn.TransformerEncoderLayer(4, 2, 2, dropout=0.0, batch_first=True),
     "a recurrent layer": Called(lambda linear, x: torch.nn.functional.tanh(linear(x)).cumprod(dim=1)),
     "an image that is looked up": Called(looked_up),
-    "a checkpoint": Called(lambda linear, x: torch.utils.checkpoint.checkpoint(linear, x, use_reentrant=False) ** 2),
+    "a checkpoint": Called(lambda linear, x: checkpoint(linear, x, use_reentrant=False) ** 2),
 }
 
 
@@ -299,7 +301,7 @@ ERRORS = {
     ),
     "a loss of sequences": (torch.nn.Linear(3, 4), ctc, drawn(4, 3), "_ctc_loss_backward.*; write that operation"),
     "a reentrant checkpoint": (
-        Called(lambda linear, x: torch.utils.checkpoint.checkpoint(torch.tanh, linear(x), use_reentrant=True)),
+        Called(lambda linear, x: checkpoint(torch.tanh, linear(x), use_reentrant=True)),
         lambda out, y: (out**2).mean(),
         drawn(4, 3),
         "use_reentrant=False",

@@ -52,7 +52,7 @@ def weights_of(x):
 
 
 BACKWARDS = {
-    "once differentiable": once_differentiable(lambda x, grad: 2 * x * grad),
+    "once differentiable": once_differentiable(lambda x, grad: 2 * x * grad),  # pyright: ignore
     "numpy": lambda x, grad: torch.from_numpy(2 * x.detach().numpy() * grad.detach().numpy()),
     "None for the second derivative": lambda x, grad: TwiceWrong.apply(x, grad),
 }

@@ -61,7 +61,7 @@ def test_spz_comes_back_in_the_axes_of_a_ply(tmp_path, degree):
     torch.testing.assert_close(g.sh[:, 1:], true.sh[:, 1:], rtol=0, atol=0.51 / 128)
     require_same_rotations(g.quats, true.quats, 0.99)
     unturned = found.other_axes  # what a converter that leaves the axes as they are has meant by the same bytes
-    assert torch.equal(unturned.means, g.means * torch.tensor([1.0, -1.0, -1.0]))
+    assert unturned is not None and torch.equal(unturned.means, g.means * torch.tensor([1.0, -1.0, -1.0]))
 
 
 def test_compressed_ply_comes_back_in_its_own_order(tmp_path):

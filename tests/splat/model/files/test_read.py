@@ -176,7 +176,8 @@ def coloured(kind: str, name: str, white: float) -> bytes:
     for column, values in {**kept, **dict.fromkeys(("red", "green", "blue"), white * np.array([1, 0.2, 0]))}.items():
         rows[column] = values
     head = [
-        f"property {name if rows.dtype[k].str[1:] == kind and k not in kept else 'float'} {k}" for k in rows.dtype.names
+        f"property {name if rows.dtype[k].str[1:] == kind and k not in kept else 'float'} {k}"
+        for k in rows.dtype.names or ()
     ]
     return (
         "\n".join(["ply", "format binary_little_endian 1.0", "element vertex 3", *head, "end_header\n"]).encode()

@@ -166,7 +166,10 @@ def test_an_spz_is_read_in_the_axes_in_which_it_looks_like_the_scene(folder):
         opened(stored(folder / f"{i}.spz", written.spz(each)), trained_by=OURS) for i, each in enumerate((g, turned))
     ]
     assert torch.equal(both[0].training.gaussians.means, both[1].training.gaussians.means)
-    assert [any("axes are those of a PLY" in note for note in each.origin["notes"]) for each in both] == [False, True]
+    assert [any("axes are those of a PLY" in note for note in (each.origin or {})["notes"]) for each in both] == [
+        False,
+        True,
+    ]
 
 
 @pytest.mark.parametrize(
