@@ -115,7 +115,8 @@ def family(
     """The family of one operator; active: what its known null space leaves; lead: what is known beforehand."""
     rank = operator.dim if active is None else active.rank
     eigen = settings.eigen if rank >= settings.eigen.wanted else EigenSettings(1, 0, rtol=settings.eigen.rtol)
-    ends = extreme_eigenpairs(operator, generator, eigen, lead.start, progress)
+    search = operator if active is None else _Lifted(operator, active, spawn(generator))
+    ends = extreme_eigenpairs(search, generator, eigen, lead.start, progress)
     if eigen.smallest == 0:  # one direction: both ends are the same
         ends = EigenEnds(ends.largest, ends.largest, ends.method, ends.matvecs, ends.beyond, ends.noise, ends.ritz)
     starts, steps, batch = settings.starts, settings.steps, settings.batch
@@ -124,6 +125,23 @@ def family(
         batch=batch, progress=progress, active=active, ends=ends, trace=lead.trace,
     )  # fmt: skip
     return Family(rank, ends, density, anisotropy(ends, density))
+
+
+class _Lifted:
+    """P H P + c (1 - P), for the projector P onto what a known null space leaves and a Rayleigh quotient c of P H P.
+
+    The eigenvalue of the null space, c, lies between the smallest and the largest one of the rest: both ends are of the rest.
+    """
+
+    def __init__(self, inner: SymmetricOperator, active: ActiveSpace, generator: torch.Generator) -> None:
+        self.inner, self.project = inner, active.project
+        self.dim, self.dtype, self.blocks = inner.dim, inner.dtype, inner.blocks
+        v = active.project(torch.randn(inner.dim, 1, generator=generator, dtype=inner.dtype, device=generator.device))
+        self.level = float((v * inner.apply(v)).sum() / v.square().sum())
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        left = self.project(V)
+        return self.project(self.inner.apply(left)) + self.level * (V - left)
 
 
 def _named(progress: Progress | None, name: str) -> Progress | None:

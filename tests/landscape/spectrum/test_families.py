@@ -60,6 +60,22 @@ def test_a_known_null_space_is_not_counted():
     assert found.indices.effective_rank.low <= rank <= found.indices.effective_rank.high <= 30
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_ends_are_of_what_a_known_null_space_leaves(dtype, sign):
+    """Semi-definite matrices of 72 rows and rank 54: an end of 0 would be that of the null space."""
+    for seed in range(15):
+        stream = generator(seed)
+        basis = torch.linalg.qr(torch.randn(72, 54, generator=stream, dtype=torch.float64)).Q
+        true = torch.linspace(0, 1 + seed % 5, 54, dtype=torch.float64).exp() * sign
+        P, H = (basis @ basis.T).to(dtype), (basis * true @ basis.T).to(dtype)
+        found = family(DenseOperator(H), stream, active=ActiveSpace(lambda V, P=P: P @ V, 54))
+        ratio = float(true.max() / true.min())
+        assert found.indices.literal.low <= ratio <= found.indices.literal.high < float("inf")
+        for end, value in ((found.ends.largest, true.max()), (found.ends.smallest, true.min())):
+            assert abs(float(end.values[0] - value)) <= 0.02 * abs(float(value))
+
+
 def test_a_part_of_one_row_has_one_eigenvalue():
     H = DenseOperator(torch.diag(torch.tensor([3.0, 2.0, 1.0]).double()), {"one": slice(0, 1), "two": slice(1, 3)})
     found = families(H, generator())
