@@ -13,7 +13,7 @@ Every estimator returns a frozen dataclass: each number with its error, and the 
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from math import isfinite, sqrt
+from math import erf, isfinite, sqrt
 from pathlib import Path
 from textwrap import fill
 from typing import Any, Literal
@@ -98,22 +98,23 @@ def standard_deviation(samples: Float64[Tensor, "s *shape"]) -> Float64[Tensor, 
 
 
 def sampling_error(terms: Float64[Tensor, " m"], population: int) -> Number:
-    """Standard error of the mean of m terms as that of all `population` of which they are, had they been drawn at random.
+    """Error of the mean of m terms as that of all `population` of which they are, had they been drawn at random.
 
-    s sqrt(1/m - 1/M), with the terms' standard deviation s, which errors of their own make larger; 0 where they are all,
-    None of a single one.
+    q s sqrt(1/m - 1/M), with the terms' standard deviation s, which errors of their own make larger; 0 where they are all,
+    None of a single one.  q, 1 for many terms, is Student's factor: twice the error holds as often as two standard errors do.
 
     >>> import torch
     >>> terms = torch.tensor([1.0, 3.0], dtype=torch.float64)
     >>> sampling_error(terms, 2), round(sampling_error(terms, 4), 12), sampling_error(terms[:1], 4)
-    (0.0, 0.707106781187, None)
+    (0.0, 4.938338370835, None)
     """
     m = len(terms)
     if m >= population:
         return 0.0
     if m < 2:
         return None
-    return float(standard_deviation(terms)) * sqrt(1 / m - 1 / population)
+    student = t_quantile(m - 1, erf(sqrt(2))) / 2
+    return student * float(standard_deviation(terms)) * sqrt(1 / m - 1 / population)
 
 
 @dataclass(frozen=True)

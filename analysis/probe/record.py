@@ -133,8 +133,10 @@ def left_out_note(views: int, population: int | None) -> list[str]:
         return []
     return [
         f"measured on {views} of {population} training views: what the others would change stands beside the loss, the "
-        "traces and, along the directions found, the eigenvalues, as a standard error, as if the views had been drawn at "
-        "random; views left out may hold steeper directions; for the other numbers it is not known"
+        "traces and, along the directions found, the eigenvalues, as if the views had been drawn at random: twice it holds as "
+        "often as two standard errors; the largest eigenvalue of few views is usually too large (around an object of 24 views "
+        "by a median of 72% to 76% from 2 of them, 48% to 52% from 3, 17% to 44% from 4, 5% to 12% from 8; where all cameras "
+        "face one way by at most 3%); for the other numbers it is not known"
     ]
 
 

@@ -157,7 +157,8 @@ class End(Struct, kw_only=True):
 
     residual: |H v - value v|: an eigenvalue lies within this distance.  vector_error: about the sine of the angle between v and
     the true eigenvector.  reason, note: as for `TraceOf`.  views_error: likewise, of v . H v at this v; in the views left out
-    another direction may be steeper.  without_one: least and largest v . H v with one of the views measured left out.
+    another direction may be steeper; the largest eigenvalue of few views is usually too large, as it is convex in H.
+    without_one: least and largest v . H v with one of the views measured left out.
     """
 
     value: Number
