@@ -22,9 +22,10 @@ from torch import Tensor
 from analysis.measures.localization import mass_shares, masses, participation
 from analysis.records.quantities import Shade, percent, quantity, ratio
 from analysis.records.run_files import Carrier, Steepest
+from analysis.records.schema import Carries
 from landscape import curvature_reach
 from splat.backend.cpu.threads import single_threaded, thread_count
-from splat.curvature.fields import Values
+from splat.curvature.fields import Values, sight_fields
 from splat.curvature.objective import SceneObjective
 from splat.projection.formulas import lens_of
 from splat.projection.reference import NEEDLE
@@ -69,7 +70,7 @@ def steepest(
     order = mass.argsort(descending=True, stable=True)[:MOST].tolist()
     chosen = [i for i in order if mass[i] >= LEAST] or order[:1]
     view = objective.views[_view_with_most(sights, chosen[0])]
-    carriers = [_carrier(objective, view, end, values, mass, i) for i in chosen]
+    carriers = [_carrier(objective, view, end.vector, values, mass, i) for i in chosen]
     crop = crop_around([each.outline for each in carriers], view.camera.width, view.camera.height)
     loss = objective.loss(objective.active.flat)
     steps = [curvature_reach(end.curvature, RISE * loss) / 2**k for k in range(STEPS)]
@@ -90,6 +91,28 @@ def steepest(
         sentence=sentence(end, carriers, spread, view, len(objective.views)),
     )  # fmt: skip
     return found, pictures
+
+
+def heaviest(objective: SceneObjective, vectors: Sequence[Float[Tensor, " p"]]) -> list[Carries]:
+    """The Gaussian with most mass in each eigenvector; with its shape where this process has all views, on the CPU."""
+    whole = objective.ranks.size == 1 and objective.active.flat.device.type == "cpu"
+    sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views] if whole else []
+    found = []
+    for vector in vectors:
+        mass = masses(vector, objective.active)
+        mass, i = mass / mass.sum(), int(mass.argmax())
+        part = objective.active.with_flat(vector).select(torch.tensor([i], device=mass.device))
+        shares = mass_shares(part.flat, part.blocks)
+        one = Carries(
+            gaussian=int(objective.mask.nonzero()[i, 0]),
+            share=float(mass[i]),
+            attribute=max(shares, key=shares.__getitem__),
+        )
+        if whole:
+            view = objective.views[_view_with_most(sights, i)]
+            one.shape = shape(_carrier(objective, view, vector, sight_fields(sights), mass, i), view)
+        found.append(one)
+    return found
 
 
 def heaviest_view(objective: SceneObjective, vector: Float[Tensor, " p"]) -> int:
@@ -149,10 +172,10 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
 
 
 def _carrier(
-    objective: SceneObjective, view: View, end: End, values: Values, mass: Float64[Tensor, " n"], i: int
+    objective: SceneObjective, view: View, vector: Tensor, values: Values, mass: Float64[Tensor, " n"], i: int
 ) -> Carrier:
     active, index = objective.active, torch.tensor([i])
-    part = active.with_flat(end.vector).select(index)
+    part = active.with_flat(vector).select(index)
     shares = mass_shares(part.flat, part.blocks)
     splats, _, _ = backend_of(active.flat).project(active.select(index), lens_of(view.camera, objective.settings))
     outline = outline_of(splats[0].double())
@@ -238,6 +261,19 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
     """
     first = carriers[0]
     name = max(first.attributes, key=first.attributes.__getitem__)
+    some = "both" if count == 2 else f"all {count}"
+    seen = "one view" if first.views == 1 else f"{some if first.views == count else f'{first.views} of {count}'} views"
+    if first.views > 1 and first.one_view >= 0.9:
+        seen += f", one of which has {first.one_view:.0%} of its weight"
+    alone = "" if first.share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
+    return (
+        f"{percent(first.share)} of {end.name}, {end.title}, lies on Gaussian {first.gaussian:,}, which it {VERBS[name]}: "
+        f"{shape(first, view)}, seen by {seen}{alone}."
+    )
+
+
+def shape(first: Carrier, view: View) -> str:
+    """Kind and place of a carrier's splat in a view, in words."""
     kind = f"a splat of {ratio(first.aspect)}"
     if first.aspect**2 > NEEDLE:
         large, middle, small = first.sigmas
@@ -246,12 +282,4 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
     x, y = first.outline[0] / view.camera.width, first.outline[1] / view.camera.height
     row, column = (min(max(int(3 * each), 0), 2) for each in (y, x))
     outside = "" if 0 <= x < 1 and 0 <= y < 1 else ", its centre outside of the picture"
-    some = "both" if count == 2 else f"all {count}"
-    seen = "one view" if first.views == 1 else f"{some if first.views == count else f'{first.views} of {count}'} views"
-    if first.views > 1 and first.one_view >= 0.9:
-        seen += f", one of which has {first.one_view:.0%} of its weight"
-    alone = "" if first.share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
-    return (
-        f"{percent(first.share)} of {end.name}, {end.title}, lies on Gaussian {first.gaussian:,}, which it {VERBS[name]}: "
-        f"{kind} {PLACES[row][column]} of {view.name.rpartition('/')[2]}{outside}, seen by {seen}{alone}."
-    )
+    return f"{kind} {PLACES[row][column]} of {view.name.rpartition('/')[2]}{outside}"

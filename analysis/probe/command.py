@@ -31,7 +31,7 @@ from analysis.probe.options import ProbeOptions
 from analysis.probe.plan import Expected, expected_seconds, seconds_of_render
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.settings import ProbeSettings
-from analysis.probe.summary import remarks, summary
+from analysis.probe.summary import guess, remarks, steps_made, summary
 from analysis.probe.views import write_views
 from analysis.records.provenance import require_seed
 from analysis.records.records import Arrays, ProbeRecord, record_folder, require_replaceable
@@ -87,7 +87,8 @@ def _run(
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     after = {} if families is None else families.expected
-    say(_introduction(scene, checkpoint, objective), console=console)
+    guessed = guess(checkpoint.origin)
+    say(*guessed, _introduction(scene, checkpoint, objective), console=console)
     say(_expected(objective, settings, after), console=console)
     made = asked(options, checkpoint)
     identity = f"{made.but('settings.families').digest} {device}"  # families are measured after what is kept
@@ -99,13 +100,14 @@ def _run(
         telling_needs(objective),
     ):
         generator = torch.Generator(device).manual_seed(options.seed)
+        lengths = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
         found = measure(
-            objective, settings, generator, stages, None if ranks else unfinished, identity,
+            objective, settings, lengths, generator, stages, None if ranks else unfinished, identity,
             deadline=begun + limit - DRAWING, population=checkpoint.all_views, after=after,
         )  # fmt: skip
         origin = provenance_of(made, options.checkpoint, command, checkpoint, scene)
         data, arrays = probe_record(found, objective, origin, stages.timing), probe_arrays(found)
-        data.steps = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
+        data.steps = lengths
         if families is not None:
             data = _with_families(data, arrays, families, objective, checkpoint, generator, stages, found.ends)
         data.notes += [*scene.notes, *checkpoint.assumptions]
@@ -114,7 +116,7 @@ def _run(
     if writes:
         if not found.unreached:
             shutil.rmtree(unfinished, ignore_errors=True)
-        _conclude(data, out, options.verbose)
+        _conclude(data, out, options.verbose, guessed)
     failed = any(check.passed is False for check in data.checks.values())
     return CHECK_FAILED if options.strict and failed else 0
 
@@ -238,7 +240,8 @@ def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjectiv
     counts, training, camera = objective.counts, checkpoint.training, objective.views[0].camera
     views = f"{counts.views} of {checkpoint.all_views}" if checkpoint.all_views else f"{counts.views}"
     return (
-        f"{scene.name} after {training.step} steps: {views} views of {camera.width} x {camera.height} px, "
+        f"{scene.name}, {steps_made(training.step, bool(checkpoint.origin))}: "
+        f"{views} views of {camera.width} x {camera.height} px, "
         f"{counts.active_gaussians:,} of {counts.gaussians:,} Gaussians in sight, "
         f"{counts.active_parameters:,} active parameters"
     )
@@ -252,7 +255,7 @@ def _expected(objective: SceneObjective, settings: ProbeSettings, after: Expecte
     return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
 
 
-def _conclude(data: ProbeRecord, out: Path, verbose: bool) -> None:
+def _conclude(data: ProbeRecord, out: Path, verbose: bool, guessed: Sequence[str]) -> None:
     """Print the summary (verbose: and the tables), what failed and what is not known, with remedies."""
     from analysis.records.report import FILE as REPORT
 
@@ -265,4 +268,4 @@ def _conclude(data: ProbeRecord, out: Path, verbose: bool) -> None:
         console.print(family_table(data))
     for line in remarks(data, verbose):
         console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False, markup=False)
-    say(*summary(data, out / REPORT), console=console)
+    say(*summary(data, out / REPORT), *guessed, console=console)

@@ -6,7 +6,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from analysis.measures.gradient_check import ProductCheck
-from analysis.records.schema import Depth
+from analysis.records.schema import Carries, Depth
 from landscape import EigenEnds, OperatorCheck, Slice, SpectralDensity, TraceEstimate
 from landscape.slices.finite_probe import FiniteProbe
 from splat.curvature.scores.shares import BlockShare
@@ -19,6 +19,18 @@ class PlaneSlice:
     slice: Slice
     loss_scale: float
     units: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """Losses at finite steps along the eigenvectors of both ends (None of an eigenvalue 0), and the Gaussians that carry these.
+
+    steps: the optimiser's along each.
+    """
+
+    ends: tuple[FiniteProbe | None, FiniteProbe | None]
+    steps: tuple[float, float]
+    carriers: list[Carries]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +56,7 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Results of all stages; density, power, finite, depth, plane and shares are None where a note says why.
+    """Results of all stages; rendered, density, power, finite, depth, plane and shares are None where a note says why.
 
     matvecs: products H v of all stages; spared: products of single views, known to be 0 and left out; rank: number of
     directions that are not exactly flat; unreached: stages that time did not reach; left_out: of training views, if any were.
@@ -61,6 +73,7 @@ class Measured:
     finite: FiniteProbe | None
     depth: Depth | None
     plane: PlaneSlice | None
+    rendered: Rendered | None
     shares: list[BlockShare] | None
     matvecs: int
     spared: int

@@ -5,6 +5,9 @@
     traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled where that
                         is cheaper
     eigenvalues         the two largest and the smallest, from the start vectors of `splat.curvature.block_eigenvectors`
+    renders             the second difference of the loss along the eigenvectors of both ends, at steps that double, from a part
+                        of the optimiser's to one at which the curvature alone changes the loss by 1%; the Gaussian that
+                        carries each end
     slice               the loss over the plane of the first two eigenvectors: rendered where needed, interpolated elsewhere
     density *           stochastic Lanczos quadrature, for sums of |lambda|; the Krylov spaces of its first runs
                         contain the iterates of the paper's power iteration
@@ -18,10 +21,10 @@ their accuracy or at a limit on products; their results say which.  Time ends th
 seed alone, also those of stages kept from an earlier run.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from math import inf
+from math import ceil, inf, log2
 from pathlib import Path
 
 import torch
@@ -32,8 +35,10 @@ from analysis.console.kept import Kept
 from analysis.console.stages import Stages
 from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import ProductCheck, check_against_gradient
+from analysis.measures.localization import mass_shares
 from analysis.measures.memory import basis_within, vectors_within
-from analysis.probe.measured import LeftOut, Measured, PlaneSlice, Spectrum
+from analysis.measures.steepest import heaviest
+from analysis.probe.measured import LeftOut, Measured, PlaneSlice, Rendered, Spectrum
 from analysis.probe.plan import MOST_AT_ONCE, NOTHING, Expected, plan_of, seconds_of_product, seconds_of_render
 from analysis.probe.settings import FEWEST_STEPS, ProbeSettings
 from analysis.records.schema import Depth
@@ -67,18 +72,34 @@ from splat.curvature.scores.shares import BlockShare, block_shares
 from splat.curvature.traces import block_traces, exact_traces
 from splat.render.backend import CPU, backend_of
 
-STAGES = ("traces", "eigenvalues", "slice", "density", "power iteration", "finite probe", "depth", "block shares")
+STAGES = (
+    "traces",
+    "eigenvalues",
+    "slice",
+    "density",
+    "power iteration",
+    "finite probe",
+    "depth",
+    "block shares",
+    "renders",
+)
 LEFT_OUT = {  # notes on stages that the settings exclude
     "density": "the spectral density was left out, and the indices that need it",
     "finite probe": "the finite probe was left out",
     "depth": "positions along and across the rays were left out",
 }
+RISE, MOST_DOUBLINGS = (
+    0.01,
+    7,
+)  # longest step of renders along the ends: change of the loss, and from the optimiser's step
+FEW_POINTS = 8  # renders that tell the noise of one
 MOST_SAMPLES = 64  # of a trace on a CPU: more would take longer than summing the exact blocks
 
 
 def measure(
     objective: SceneObjective,
     settings: ProbeSettings,
+    lengths: Mapping[str, float],
     generator: torch.Generator,
     stages: Stages,
     folder: Path | None = None,
@@ -89,8 +110,8 @@ def measure(
 ) -> Measured:
     """Run every stage.
 
-    folder, identity, deadline: see `Kept`.  population: number of training views, where the objective has fewer.  after: stages
-    that the caller runs afterwards.
+    lengths: of the optimiser's first step in a parameter, by attribute.  folder, identity, deadline: see `Kept`.  population:
+    number of training views, where the objective has fewer.  after: stages that the caller runs afterwards.
     """
     with stages.stage("linearise") as report:
         at = _linearised(objective, settings, report)
@@ -103,7 +124,7 @@ def measure(
     kept = Kept(stages, generator, STAGES, at.work, folder, identity, deadline)
     plan = plan_of(settings, product, render, after)
     stages.expect({name: work for name, work in plan.items() if not kept.has(name)}, words)
-    return _all_stages(at, kept, operator_check, gradient_check, of_checks, population)
+    return _all_stages(at, lengths, kept, operator_check, gradient_check, of_checks, population)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +165,7 @@ def _compile_blocks(objective: SceneObjective) -> None:
 
 def _all_stages(
     at: _Point,
+    lengths: Mapping[str, float],
     kept: Kept,
     operator_check: OperatorCheck,
     gradient_check: ProductCheck,
@@ -155,6 +177,7 @@ def _all_stages(
     traces = kept.run("traces", dict[str, TraceEstimate], partial(_traces, at, kept), ends_in_time=True)
     ends = kept.run("eigenvalues", EigenEnds, partial(_ends, at, kept), ends_in_time=True)
     assert traces is not None and ends is not None  # stages that end in time always return something
+    rendered = kept.run("renders", Rendered, partial(_rendered, at, ends, lengths))
     plane = kept.run("slice", PlaneSlice | None, partial(_plane, at, ends))  # pyright: ignore[reportArgumentType]
     spectrum = power = finite = depth = None
     if settings.density_matvecs:
@@ -180,6 +203,7 @@ def _all_stages(
         finite=finite,
         depth=depth,
         plane=plane,
+        rendered=rendered,
         shares=shares,
         matvecs=matvecs,
         spared=spared,
@@ -260,6 +284,26 @@ def _finite(at: _Point, ends: EigenEnds, _: torch.Generator, report: Progress, _
     center, vector = at.objective.active.flat, ends.largest.vectors[:, 0]
     steps, points = at.settings.probe_steps, at.settings.noise_points
     return finite_probe(at.objective.evaluate, center, vector, at.operator, steps, report, points)
+
+
+def _rendered(
+    at: _Point, ends: EigenEnds, lengths: Mapping[str, float], _: torch.Generator, report: Progress, __: list[str]
+) -> Rendered:
+    """Renders along both ends, and who carries these."""
+    probes, steps, objective = [], [], at.objective
+    pairs = (ends.largest, ends.smallest)
+    for pair in pairs:
+        shares, value = mass_shares(pair.vectors[:, 0], objective.blocks), float(pair.values[0])
+        # root mean square of d . v over random signs of d: the root of the sum of v_i^2 d_i^2
+        step = sum(share * lengths[name] ** 2 for name, share in shares.items()) ** 0.5
+        reach = curvature_reach(value, RISE * at.value) if value and at.value > 0 else step
+        doublings = min(max(ceil(log2(reach / step)), 1), MOST_DOUBLINGS) if step else 0
+        along = [step * 2.0**k for k in range(-at.settings.halvings, doublings + 1)]
+        probe = partial(finite_probe, objective.evaluate, objective.active.flat, pair.vectors[:, 0], at.operator)
+        probes.append(probe(along, report, FEW_POINTS) if value and step else None)
+        steps.append(step)
+    carriers = heaviest(objective, [pair.vectors[:, 0] for pair in pairs])
+    return Rendered((probes[0], probes[1]), (steps[0], steps[1]), carriers)
 
 
 def _depth(at: _Point, accuracy: TraceSettings, generator: torch.Generator, report: Progress, _: list[str]) -> Depth:

@@ -24,6 +24,7 @@ NOTHING: Expected = MappingProxyType({})
 TYPICAL: Expected = {
     "traces": (25, 11, 0),
     "eigenvalues": (60, 28, 0),
+    "renders": (0, 0, 70),
     "slice": (320, 0, 240),
     "depth": (0, 3, 60),
     "block shares": (0, 4, 0),

@@ -21,6 +21,7 @@ from analysis.records.records import Check, Counts, ProbeRecord, Skip
 from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, literal
 from landscape.results import Bracket, finite_or_none, sampling_error
+from landscape.slices.finite_probe import FiniteProbe
 from landscape.slices.slice import Slice as Grid
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import ActiveCounts, SceneObjective
@@ -193,12 +194,33 @@ def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalu
     rows = schema.Eigenvalues(max=exact(largest, 0), second=exact(largest, 1), min=exact(smallest, 0))
     if power is not None:
         rows.power_max, rows.power_min = eigenvalue(power, power.largest), eigenvalue(power, power.smallest)
+    if found.rendered is not None:
+        rendered = zip(found.rendered.ends, found.rendered.steps, found.rendered.carriers, strict=True)
+        for end, (probe, step, carrier) in zip((rows.max, rows.min), rendered, strict=True):
+            end.carrier = carrier
+            end.renders = UNSET if probe is None else _renders(probe, step)
     if found.left_out is not None:
         for end, curvatures in zip((rows.max, rows.second, rows.min), found.left_out.curvatures.T, strict=True):
             if end:
                 end.views_error = sampling_error(curvatures, found.left_out.population)
                 end.without_one = without_one(curvatures)
     return rows
+
+
+def _renders(probe: FiniteProbe, step: float) -> schema.Renders:
+    """step: the optimiser's along this direction."""
+    confirmed, steps = probe.confirmation(step / 10)
+    low, high = steps or (None, None)
+    numbers = {
+        "steps": probe.steps,
+        "ratios": probe.curvatures / probe.infinitesimal,
+        "errors": probe.round_off / abs(probe.infinitesimal),
+    }
+    return convert(
+        {name: [finite_or_none(x) for x in found.tolist()] for name, found in numbers.items()}
+        | {"confirmed": confirmed, "low": low, "high": high, "optimiser_step": step},
+        schema.Renders,
+    )
 
 
 def without_one(curvatures: Float64[Tensor, " m"]) -> tuple[float, float] | UnsetType:
@@ -276,14 +298,15 @@ def counts_of(active: ActiveCounts, views_of: int | None, **work: int) -> Counts
 
 
 def _counts(found: Measured, objective: SceneObjective) -> Counts:
-    renders = 0 if found.plane is None else found.plane.slice.evaluations * objective.counts.views
+    evaluations = 0 if found.plane is None else found.plane.slice.evaluations
+    evaluations += sum(each.evaluations for each in (found.rendered.ends if found.rendered else ()) if each)
     return counts_of(
         objective.counts,
         found.left_out and found.left_out.population,
         rank=found.rank,
         views_kept_linearised=objective.linearized.kept,
         products=found.matvecs,
-        renders=renders,
+        renders=evaluations * objective.counts.views,
     )
 
 

@@ -1,28 +1,59 @@
-"""A probe in six lines, for the terminal, and what has to be said beside them."""
+"""A probe in eight lines, for the terminal, and what has to be said beside them.
 
+Numbers have two digits; the errors beside them are named.  "one training": a number that another seed changes.
+"""
+
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-from analysis.records.findings import Line, findings, is_loose
-from analysis.records.quantities import UNDETERMINED, apart, limits, measured, quantity
+from analysis.records.findings import Line, findings, is_loose, largest_steps, shares_per_trace
+from analysis.records.quantities import UNDETERMINED, apart, percent, rough, solved
 from analysis.records.records import Check, Counts, ProbeRecord
-from analysis.records.schema import Index, Trace
+from analysis.records.schema import Eigenvalue
 
-SHORT = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "SH"}
+SHORT = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "colour"}
+MOVED = {"means": "moved", "log_scales": "stretched", "quats": "turned", "opacity_logits": "faded", "sh": "recoloured"}
+CARRIED = 0.5  # least share of an eigenvector that one Gaussian has where it is said to carry it
+ONE = "one training"
 
 
 def summary(data: ProbeRecord, report: Path) -> list[str]:
-    """Lines on the scene, both ends of the spectrum, the traces' order, an index, the checks, and the page to open."""
-    counts, made = data.counts, data.provenance
-    scene = f"{made.scene or 'scene'} after {made.iteration or 0:,} steps"
-    return [
-        f"scene   {scene}: {_views(counts)}, {counts.visible_gaussians:,} Gaussians in sight",
-        f"ends    {_ends(data)}",
-        f"traces  {_order(data.traces)}",
-        f"index   {_index(data)}",
-        f"checks  {_checks(data)}; {data.timing['total']:.0f} s",
-        f"report  {report}",
-    ]
+    """Lines on the scene, both ends of the spectrum, a step of the optimiser, the spread, the checks, and the page to open."""
+    counts, made, ends = data.counts, data.provenance, data.eigenvalues
+    lines = {
+        "scene": f"{made.scene or 'scene'}, {steps_made(made.iteration, bool(made.origin))}, {_views(counts)}; "
+        f"{counts.visible_gaussians:,} Gaussians in sight",
+        "steepest": _end(ends.max),
+        "negative" if (ends.min.value or 0.0) < 0 else "lowest": _end(ends.min),
+        "a step": _step(data),
+        "spread": _spread(data),
+        "checks": f"{_checks(data)}; {data.timing['total']:.0f} s",
+        "seeds": f"{ONE}: other seeds give other extreme eigenvalues (landscape compare, three seeds of each)",
+        "report": f"{report}",
+    }
+    return [f"{name:<9} {text}" for name, text in lines.items() if text]
+
+
+def steps_made(steps: int | None, foreign: bool) -> str:
+    """Number of steps of the training; a file of another tool, foreign, may not say it.
+
+    >>> steps_made(2000, False), steps_made(0, True), steps_made(0, False)
+    ('2,000 steps', 'steps not known', '0 steps')
+    """
+    return "steps not known" if foreign and not steps else f"{steps or 0:,} steps"
+
+
+def guess(origin: Mapping[str, Any] | None) -> list[str]:
+    """A sentence on training views that nothing names: the first and the last that is printed.  origin: of the checkpoint.
+
+    >>> guess({"views": "guessed: all"}), guess({"views": "as listed"}), guess(None)
+    (['the training views are guessed: all; --views or --train-list names them'], [], [])
+    """
+    views = str((origin or {}).get("views", ""))
+    known = f"the training views are {views}; --views or --train-list names them"
+    return [known] if views.startswith("guessed") else []
 
 
 def _views(counts: Counts) -> str:
@@ -38,34 +69,69 @@ def remarks(data: ProbeRecord, verbose: bool) -> list[Line]:
     return [line for line in findings(data) if line.level in levels]
 
 
-def _ends(data: ProbeRecord) -> str:
-    texts = []
-    for end in (data.eigenvalues.min, data.eigenvalues.max):
-        value = measured(end.value, end.residual) + apart(end.views_error)
-        texts.append(value if end.is_reached else f"{UNDETERMINED} (not reached)")
-    return f"curvature from {texts[0]} to {texts[1]}"
+def _end(end: Eigenvalue) -> str:
+    """Eigenvalue, curvature over the optimiser's step, carrier, and what renders say."""
+    if not end.is_reached:
+        return f"{UNDETERMINED} (not reached)"
+    value, renders = end.value or 0.0, end.renders
+    notes = [ONE]
+    if renders and (value > 0 or renders.confirmed):
+        at = renders.at_step
+        over = "hidden by round-off" if at is None else rough(at * value)
+        notes.insert(0, f"{over} over the optimiser's step")
+    text = f"{solved(value, end.residual)}{apart(end.views_error)} ({', '.join(notes)})"
+    return f"{text}{_carrier(end)}; {_rendered(end)}"
 
 
-def _order(traces: dict[str, Trace]) -> str:
-    """Traces by size; ≈ between two that are within two standard errors of each other, or whose errors are not known."""
-    ranked = sorted(traces.items(), key=lambda item: -abs(item[1].value or 0.0))
-    texts = [f"{SHORT.get(name, name)} {quantity(trace.value)}{apart(trace.views_error)}" for name, trace in ranked]
-    signs = [" > " if first.exceeds(second) else " ≈ " for (_, first), (_, second) in pairwise(ranked)]
-    return "".join(part for pair in zip(texts, [*signs, ""], strict=True) for part in pair)
+def _carrier(end: Eigenvalue) -> str:
+    carrier = end.carrier
+    if not carrier:
+        return ""
+    if carrier.share < CARRIED:
+        return f": over many Gaussians, at most {percent(carrier.share)} on one"
+    shape = f"{carrier.shape}, " if carrier.shape else ""
+    return f": {percent(carrier.share)} on Gaussian {carrier.gaussian:,}, {shape}{MOVED[carrier.attribute]}"
 
 
-def _index(data: ProbeRecord) -> str:
-    """The first of the literal index and what stands for it that is known, with its bracket."""
-    for name, words in (("literal", "λ max / λ min"), ("share", "share of λ max in all curvature")):
-        index: Index | None = getattr(data.anisotropy, name) or None
-        if index and not is_loose(index) and index.low is not None and index.high is not None:
-            low, high = limits(index.low, index.high)
-            error = max(index.high - (index.value or 0.0), (index.value or 0.0) - index.low)
-            narrow = error < 0.1 * abs(index.value or 0.0)
-            return f"{words} = " + (
-                measured(index.value, error) if narrow else f"{quantity(index.value)}, between {low} and {high}"
-            )
-    return f"λ max / λ min = {UNDETERMINED}"
+def _rendered(end: Eigenvalue) -> str:
+    renders = end.renders
+    if not renders:
+        return "not rendered"
+    if renders.confirmed:
+        return f"renders agree from {rough(renders.low)} to {rough(renders.high)}"
+    if renders.confirmed is None:
+        return "not resolved: round-off hides it in renders"
+    return "not confirmed by renders" + (": no saddle is claimed" if (end.value or 0.0) < 0 else "")
+
+
+def _step(data: ProbeRecord) -> str:
+    """Attributes by the change of the loss in a random step of the optimiser; ≈ where errors leave the order open."""
+    shares, traces = shares_per_trace(data), data.traces
+    if not shares:
+        return ""
+
+    def change(name: str, end: int) -> float:
+        return shares[name] * traces[name].magnitudes[end]
+
+    ranked = sorted(shares, key=lambda name: -shares[name] * abs(traces[name].value or 0.0))
+    text = SHORT.get(ranked[0], ranked[0])
+    for before, name in pairwise(ranked):
+        text += (", then " if change(before, 0) > change(name, 1) else " ≈ ") + SHORT.get(name, name)
+    first = largest_steps(data)
+    times = f" ({first[2]:.2g} times as much as in {SHORT.get(first[1], first[1])})" if first else ""
+    return f"of the optimiser changes the loss most in {text}{times}"
+
+
+def _spread(data: ProbeRecord) -> str:
+    """The participation ratio and the steepest direction's part, as far as the density knows them."""
+    ratio, share, parts = data.anisotropy.effective_rank, data.anisotropy.share, []
+    if ratio and ratio.value is not None and not is_loose(ratio):
+        parts.append(
+            f"a participation ratio of {rough(ratio.value)} among {data.counts.active_parameters:,} directions"
+        )
+    if share and share.value is not None and not is_loose(share):
+        parts.append(f"the steepest holds {percent(share.value)} of all curvature")
+    return "; ".join(parts)
 
 
 def _checks(data: ProbeRecord) -> str:
@@ -78,4 +144,4 @@ def _checks(data: ProbeRecord) -> str:
 
 def _not_passed(name: str, check: Check) -> str:
     words = name.replace("_", " ")
-    return f"{words} ({quantity(check.value)} of {quantity(check.bound)})" if check.passed is False else words
+    return f"{words} ({rough(check.value)} of {rough(check.bound)})" if check.passed is False else words

@@ -13,7 +13,7 @@ from msgspec import UNSET
 
 from analysis.records import schema
 from analysis.records.provenance import Provenance
-from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
+from analysis.records.quantities import UNDETERMINED, limits, measured, quantity, solved
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
 
 ATTRIBUTES = {
@@ -49,7 +49,7 @@ def findings(data: ProbeRecord) -> list[Line]:
         *_of_traces(data),
         *_of_ends(data),
         *of_budgets({"max": ends.max.reason, "min": ends.min.reason}),
-        *_of_anisotropy(data.anisotropy),
+        *_of_anisotropy(data),
         *_of_open(data),
         *_of_needles(ends.max.lives_on, data.counts),
         *_of_finite_probe(data.finite_probe),
@@ -165,14 +165,24 @@ def _of_ends(data: ProbeRecord) -> list[Line]:
     top, top_error, bottom, bottom_error = numbers
     where = f"over {data.counts.active_parameters:,} parameters"
     where += f", with a gradient of norm {quantity(norm)}," if _is_finite(norm) else ""
-    text = f"{where} the curvature runs from {measured(bottom, bottom_error)} to {measured(top, top_error)}"
+    text = f"{where} the curvature runs from {solved(bottom, bottom_error)} to {solved(top, top_error)}"
     if bottom + bottom_error < 0 < top - top_error:
-        return [Line(f"The Hessian is indefinite, so the checkpoint is no basin in every direction: {text}.")]
+        return [Line(f"{_of_negative(ends.min)}; {text}.")]
     if bottom - bottom_error > 0:
         return [Line(f"No direction of negative curvature was found: {text}.")]
     if top + top_error < 0:
         return [Line(f"No direction of positive curvature was found: {text}.")]
     return [Line(f"Whether the Hessian is indefinite is not decided by the residuals: {text}.", "caution")]
+
+
+def _of_negative(end: schema.Eigenvalue) -> str:
+    """What renders say of a negative eigenvalue."""
+    if end.renders and end.renders.confirmed:
+        return "The Hessian is indefinite, and renders confirm it, so the checkpoint is no basin in every direction"
+    said = "with no renders to compare"
+    if end.renders:
+        said = "but round-off hides it in renders" if end.renders.confirmed is None else "but renders do not confirm it"
+    return f"The Hessian is indefinite, {said}: no saddle is claimed"
 
 
 def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
@@ -185,8 +195,10 @@ def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
     return [Line(text.format(END_NAMES[end], reason), "caution") for end, reason in spent.items()]
 
 
-def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
-    lines, saddle, share = [], family.saddle, family.share
+def _of_anisotropy(data: ProbeRecord) -> list[Line]:
+    """The ratio of both ends, unless renders refute one, and the part of the steepest direction."""
+    lines, family = [], data.anisotropy
+    share, saddle = family.share, family.saddle if data.eigenvalues.stand else None
     text = "The steepest direction up is {} times as curved as the steepest down{}."
     if saddle and _is_finite(saddle.value) and not is_loose(saddle):
         lines.append(Line(text.format(quantity(saddle.value), _bracket(saddle))))

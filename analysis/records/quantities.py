@@ -49,6 +49,26 @@ def quantity(value: float | None, error: float | None = None) -> str:
     return f"({digits}){TIMES}{power_of_ten(exponent)}"
 
 
+def rough(value: float | None) -> str:
+    """A number in two digits, for a sentence.
+
+    >>> [text.replace(HARD, " ") for text in map(rough, (27.438, 163.0, -0.16863, 2.5e-5, None))]
+    ['27', '160', '−0.17', '2.5 × 10⁻⁵', '–']
+    """
+    return UNDETERMINED if value is None else _plain(value, 2) if math.isfinite(value) else quantity(value)
+
+
+def solved(value: float | None, residual: float | None) -> str:
+    """`rough` of an eigenvalue, with the solver's residual where two digits do not hide it.
+
+    >>> [text.replace(HARD, " ") for text in (solved(27.438, 1e-5), solved(-0.17, 0.02), solved(1.0, None))]
+    ['27', '−0.17 ± 0.020 (solver)', '1.0 ± ? (solver)']
+    """
+    if value is None or residual == 0 or (residual is not None and residual < 0.005 * abs(value)):
+        return rough(value)
+    return f"{rough(value)}{PLUS_MINUS}{'?' if residual is None else rough(residual)} (solver)"
+
+
 def measured(value: float | None, error: float | None) -> str:
     """`quantity` of a number that has an error; an error of None, not determined, is written "± ?".
 

@@ -202,7 +202,7 @@ def numbers(data: ProbeRecord, mapped: MapRecord | None = None) -> list[dict[str
         compared = rendered.get((end.value or 0.0) > 0, "")
         found.append({"value": measured(end.value, end.residual), "words": f"{words}, per stored unit²{compared}"})
     found += _steepest_attribute(data)
-    if index := data.anisotropy.literal:
+    if (index := data.anisotropy.literal) and ends.stand:
         cell = bracketed(None if is_open(index) else index)
         value, words = cell.value, "λ max / λ min"
         if index.value and index.value < 0:

@@ -178,6 +178,44 @@ class End(Struct, kw_only=True):
         return not (self.reason or "").endswith("budget")
 
 
+class Renders(Struct, kw_only=True):
+    """Rendered losses along an eigenvector v beside its eigenvalue (`landscape.slices.finite_probe`).
+
+    steps: along v, stored units, each twice the one before; ratios: to the quadratic model, of the second difference to the
+    eigenvalue; errors: of these, four standard errors of round-off.  confirmed: null where round-off decides; low, high: of
+    the steps that confirm.  optimiser_step: the root mean square length along v of a step with random signs, as long as the
+    optimiser's first in every parameter: one of the steps.
+    """
+
+    confirmed: bool | None
+    low: Number = None
+    high: Number = None
+    optimiser_step: NonNegative
+    steps: list[float]
+    ratios: list[Number]
+    errors: list[Number]
+
+    @property
+    def at_step(self) -> Number:
+        """The ratio at the optimiser's step; None where round-off hides it."""
+        i = self.steps.index(self.optimiser_step)
+        ratio, error = self.ratios[i], self.errors[i]
+        return ratio if ratio is not None and error is not None and abs(ratio) > error else None
+
+
+class Carries(Struct, kw_only=True):
+    """The Gaussian with most mass in an eigenvector.
+
+    gaussian: its number among all of the checkpoint.  share: of |v|^2.  attribute: that of most mass in it.  shape: kind and
+    place of its splat, in words; empty where processes share the views or a GPU has them.
+    """
+
+    gaussian: Count
+    share: Portion
+    attribute: str
+    shape: str = ""
+
+
 class Eigenvalue(End, kw_only=True):
     """Eigenvalue of the active operator.  matvecs: products H v of its search.  shares: of v's squared mass by attribute."""
 
@@ -185,6 +223,8 @@ class Eigenvalue(End, kw_only=True):
     method: str = ""
     shares: dict[str, Portion] = {}
     lives_on: Maybe[LivesOn] = UNSET
+    renders: Maybe[Renders] = UNSET
+    carrier: Maybe[Carries] = UNSET
 
 
 class Eigenvalues(Named[Eigenvalue], kw_only=True):
@@ -195,6 +235,11 @@ class Eigenvalues(Named[Eigenvalue], kw_only=True):
     min: Eigenvalue
     power_max: Maybe[Eigenvalue] = UNSET
     power_min: Maybe[Eigenvalue] = UNSET
+
+    @property
+    def stand(self) -> bool:
+        """Whether neither end was rendered without being confirmed."""
+        return not any(end.renders and not end.renders.confirmed for end in (self.max, self.min))
 
     def __post_init__(self) -> None:
         second = self.second.value if self.second else None

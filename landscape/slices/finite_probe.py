@@ -6,6 +6,9 @@ round-off   4 sqrt(6 noise^2 + 2 (d s)^2) / d^2: four standard errors of a secon
             s = eps |theta * H v| / sqrt(12): the rounding of theta + d v, times the slope d H v there
 truncation  estimate of |c(d) - v.H v|: the term in d^2 that makes neighbouring c(d) differ.  Without meaning across a kink or a
             jump of L, where c(d) is not a derivative
+confirmed   a step where c(d) is beyond its round-off, has the sign of v.H v, and is between half and twice it.  A curvature is
+            confirmed by three such steps, each twice the one before: the curvature 2 |d| / d^2 of a kink is halved from one to
+            the next, so that it never is
 noise       standard deviation of the error of one value of L, from differences of order k = 4 of values at small even steps
             along v, in which the smooth part of L cancels: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and
             Wild 2011, Sec. 2).  At least the resolution of the numbers that the objective returns (Python floats that are all
@@ -31,6 +34,7 @@ from landscape.slices.grid_evaluations import Loss
 ORDER, NOISE_POINTS = 4, 24  # order of the differences, number of values
 CLOSER = 4  # the distance between these values is the smallest step over this ...
 ROUNDINGS = 4  # ... but at least this many round-offs of the parameters, so that each value is rounded differently
+WITHIN, RUN = 2.0, 3  # largest factor between c(d) and v.H v; consecutive steps that confirm
 STEPS = tuple(10.0 ** (k / 2) for k in range(-10, 1))
 
 
@@ -60,6 +64,23 @@ class FiniteProbe(Brief):
         if self.discontinuous is not None:
             error = error.masked_fill(self.discontinuous, torch.inf)
         return int(error.argmin()) if error.isfinite().any() else None
+
+    def confirmation(self, least: float) -> tuple[bool | None, tuple[float, float] | None]:
+        """Whether renders, say, confirm v.H v, and the shortest and longest of the steps that do; steps double.
+
+        True where RUN consecutive steps, the longest of at least `least`, confirm it; None where round-off alone decides it.
+        """
+        ratio, error = self.curvatures / self.infinitesimal, self.round_off / abs(self.infinitesimal)
+        good = (ratio >= 1 / WITHIN) & (ratio < WITHIN) & (ratio > error)
+        refuted = ~((ratio + error >= 1 / WITHIN) & (ratio - error < WITHIN))
+        ends = [i for i in range(RUN - 1, len(ratio)) if float(self.steps[i]) >= least]
+        runs = [i for i in ends if good[i - RUN + 1 : i + 1].all()]
+        if not runs:
+            return (None if any(not refuted[i - RUN + 1 : i + 1].any() for i in ends) else False), None
+        first = last = runs[-1]
+        while first and good[first - 1]:
+            first -= 1
+        return True, (float(self.steps[first]), float(self.steps[last]))
 
     def record(self) -> dict[str, Any]:
         crossed = None if self.discontinuous is None else self.discontinuous.tolist()

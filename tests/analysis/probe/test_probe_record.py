@@ -7,16 +7,18 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
+import torch
 from rich.console import Console
 
 from analysis.commands.cli import main
+from analysis.measures.localization import masses
 from analysis.probe.command import run_probe
 from analysis.probe.measurement import STAGES
 from analysis.probe.options import ProbeOptions
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import summary
 from analysis.records.json_files import plain
-from analysis.records.quantities import measured, quantity
+from analysis.records.quantities import measured
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.schema import INDICES
 from analysis.records.tables import probe_table
@@ -40,7 +42,9 @@ def test_the_record_has_counts_checks_stages_and_provenance(record, dense, run):
     assert set(data.checks) == {"symmetry", "round_off", "finiteness", "finite_difference"}
     assert data.objective.value == pytest.approx(value, rel=1e-12)
     assert data.objective.gradient_norm == pytest.approx(float(gradient.norm()), rel=1e-9)
-    stages = ["load", "linearise", "checks", *(name for name in STAGES if name != "power iteration"), "pictures"]
+    measured_on = [name for name in STAGES if name not in ("power iteration", "renders")]
+    stages = ["load", "linearise", "checks", *measured_on, "pictures"]
+    stages.insert(stages.index("slice"), "renders")  # its stream is the last, so that the others' numbers stay
     assert list(data.timing) == [*stages, "total"]
     assert sum(data.timing[stage] for stage in stages) <= data.timing["total"]
     provenance = data.provenance
@@ -158,10 +162,10 @@ def test_time_that_ends_is_said_and_the_same_command_continues_to_the_same_numbe
     assert main([*words, "--seconds", "1e-6"]) == 0
     data, said = read_record(out).data, " ".join(capsys.readouterr().out.split())
     assert data.eigenvalues.max.reason == "time budget" and data.slice is None and data.depth is None
-    assert any("time ended before: slice, density, finite probe, depth" in note for note in data.notes)
+    assert any("time ended before: renders, slice, density, finite probe, depth" in note for note in data.notes)
     assert data.anisotropy.share.value is None
     # what is not known is no number, and the command that resolves it is named
-    assert "curvature from – (not reached) to – (not reached)" in said and "λ max / λ min = –" in said
+    assert "steepest – (not reached)" in said and "λ max" not in said
     assert f"landscape probe {run / 'double.pt'} --out {out} --slice-points 5" in said
     assert main(words) == 0
     again, whole = numbers(read_record(out)), numbers(record)
@@ -169,12 +173,19 @@ def test_time_that_ends_is_said_and_the_same_command_continues_to_the_same_numbe
     assert not list(tmp_path.glob(".short.unfinished"))
 
 
-def test_the_summary_takes_six_short_lines(record):
-    lines = summary(record.data, Path("run/probe/report.html"))
-    assert len(lines) == 6 and all(len(line) <= 90 for line in lines)
-    ranked = [quantity(trace.value) for trace in sorted(record.data.traces.values(), key=lambda t: -abs(t.value))]
-    places = [lines[2].index(text) for text in ranked]
-    assert places == sorted(places) and "all 4 passed" in lines[4] and "±" in lines[3]
+def test_the_summary_says_of_both_ends_what_renders_say_and_who_carries_them(record, dense):
+    data = record.data
+    lines = dict(line.split(maxsplit=1) for line in summary(data, Path("run/probe/report.html")))
+    assert "all 4 passed" in lines["checks"] and "participation ratio" in lines["spread"] and ">" not in str(lines)
+    for name, end in (("steepest", data.eigenvalues.max), ("negative", data.eigenvalues.min)):
+        steps, least = end.renders.steps, end.renders.optimiser_step
+        assert steps == pytest.approx([steps[0] * 2**k for k in range(len(steps))]) and steps[5] == least
+        vector = torch.from_numpy(record.arrays["eigenvectors"]["largest" if name == "steepest" else "smallest"][:, 0])
+        mass = int(masses(vector, dense[0].active).argmax())
+        assert end.carrier.gaussian == int(dense[0].mask.nonzero()[mass, 0])
+        assert " of " in end.carrier.shape
+        agree = {True: "renders agree from", False: "not confirmed by renders", None: "not resolved"}
+        assert agree[end.renders.confirmed] in lines[name] and "one training" in lines[name]
 
 
 @pytest.mark.parametrize("width", [80, 120])

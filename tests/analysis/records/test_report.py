@@ -351,13 +351,51 @@ def test_most_is_over_half_and_what_the_error_does_not_separate_is_named():
 def test_attributes_have_no_order_where_an_error_is_not_known():
     """That by the views left out is not, where one of several was measured."""
     data, _ = synthetic()
-    line = summary(probe_of(data), Path())[2]
-    assert line.startswith("traces  position") and " > " in line
+    assert not [line for line in summary(probe_of(data), Path()) if line.startswith("a step")]  # of a length not known
+    data["steps"] = dict.fromkeys(data["traces"], 0.001)
+    line = next(line for line in summary(probe_of(data), Path()) if line.startswith("a step"))
+    assert "most in position, then " in line and ">" not in line
     for trace in data["traces"].values():
         trace["views_error"] = None
-    line = summary(probe_of(data), Path())[2]
-    assert " > " not in line and line.count(" ≈ ") == len(data["traces"]) - 1
+    line = next(line for line in summary(probe_of(data), Path()) if line.startswith("a step"))
+    assert " then " not in line and line.count(" ≈ ") == len(data["traces"]) - 1
     assert "Its error does not separate it from" in sentences(data)
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "ratio", "said", "found"),
+    [
+        (True, 1.5, "renders agree from 0.0010 to 0.0040", "renders confirm it, so the checkpoint is no basin"),
+        (
+            False,
+            -1.5,
+            "not confirmed by renders: no saddle is claimed",
+            "renders do not confirm it: no saddle is claimed",
+        ),
+        (
+            None,
+            1.5,
+            "not resolved: round-off hides it in renders",
+            "round-off hides it in renders: no saddle is claimed",
+        ),
+    ],
+)
+def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, found):
+    data, _ = synthetic()
+    rendered = {"steps": [1e-3, 2e-3, 4e-3], "optimiser_step": 2e-3, "ratios": [ratio] * 3, "errors": [0.1] * 3}
+    rendered |= {"confirmed": confirmed} | ({"low": 1e-3, "high": 4e-3} if confirmed else {})
+    data["eigenvalues"]["min"] |= {"value": -220.0, "residual": 1e-3, "reason": "tolerance", "renders": rendered}
+    data["eigenvalues"]["min"]["carrier"] = {
+        "gaussian": 3739, "share": 0.9, "attribute": "quats", "shape": "a needle, 158 : 1 in the picture"
+    }  # fmt: skip
+    lines = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))
+    over = ", one training" if not confirmed else "330 over the optimiser's step, one training"
+    assert lines["negative"].startswith("−220 (" + over.removeprefix(", ").replace("330", "−330"))
+    assert lines["negative"].endswith(f"90% on Gaussian 3,739, a needle, 158 : 1 in the picture, turned; {said}")
+    assert found in sentences(data) and "λ max / λ min" not in str(lines)
+    assert ("times as curved as the steepest down" in sentences(data)) == (confirmed is True)
+    tiles = [each["words"] for each in numbers(probe_of(data))]
+    assert any(words.startswith("λ max / |λ min|") for words in tiles) == (confirmed is True)
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,36 @@ def test_noise_is_measured_and_bounds_the_round_off(sigma):
     assert torch.allclose(found.round_off * found.steps.square(), torch.tensor(4 * 6**0.5 * found.noise).double())
 
 
+ONE, STEP = torch.ones(1, dtype=torch.float64), 2.0**-7
+DOUBLING = [0.7 * STEP * 2.0**k for k in range(-5, 6)]
+
+
+def judged(loss, curvature=2.0, least=STEP / 10):
+    along = finite_probe(lambda x: loss(float(x - 1)), ONE, ONE, DenseOperator(curvature * ONE[None]), DOUBLING)
+    return along.confirmation(least)
+
+
+def test_doubling_steps_confirm_a_curvature_that_they_have():
+    assert judged(lambda t: 1 + t**2) == (True, (DOUBLING[0], DOUBLING[-1]))
+    assert judged(lambda t: 1 - t**2, -2.0)[0] is True
+    # the fourth power makes c(d) more than twice the curvature from a step on, where it is refuted
+    quartic = lambda t: 1 + t**2 + 1.1 * t**4 / DOUBLING[6] ** 2  # noqa: E731
+    assert judged(quartic) == (True, (DOUBLING[0], DOUBLING[5]))
+    assert judged(quartic, least=DOUBLING[6]) == (False, None)
+
+
+@pytest.mark.parametrize("curvature", [2.0, -2.0, 3 / DOUBLING[5], 300.0])
+def test_a_kink_confirms_no_curvature(curvature):
+    assert judged(abs, curvature) == (False, None)
+    assert judged(lambda t: 1 + abs(t) - t**2, -2.0)[0] is False  # a rise along what is curved down
+
+
+def test_what_round_off_hides_is_neither_confirmed_nor_refuted():
+    random = np.random.default_rng(0)
+    for curvature in (2.0, -2.0):
+        assert judged(lambda t: 1 + t**2 + 0.1 * random.standard_normal(), curvature) == (None, None)
+
+
 def test_the_measured_noise_is_unbiased():
     values = np.random.default_rng(1).standard_normal((2000, NOISE_POINTS)) + 3 * np.arange(NOISE_POINTS) ** 3
     squares = np.array([evaluation_noise(row) ** 2 for row in values])
