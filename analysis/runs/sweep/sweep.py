@@ -20,6 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from time import monotonic
+from typing import Any
 
 import pandas as pd
 from rich.console import Console
@@ -114,7 +115,7 @@ class _Cells:
         self.sweep, self.to_do, self.jobs, self.interrupted, self.whole = sweep, to_do, jobs, interrupted, whole
         self.failed: dict[str, str] = {}
         self.elsewhere: list[Cell] = []
-        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.running: dict[str, subprocess.Popen[Any]] = {}
         self.progress = SweepProgress(sweep, to_do, jobs)
 
     @property
