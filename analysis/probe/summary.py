@@ -23,7 +23,7 @@ def summary(data: ProbeRecord, report: Path) -> list[str]:
     """Lines on the scene, both ends of the spectrum, a step of the optimiser, the spread, the checks, and the page to open."""
     counts, made, ends = data.counts, data.provenance, data.eigenvalues
     lines = {
-        "scene": f"{made.scene or 'scene'}, {steps_made(made.iteration, bool(made.origin))}, {_views(counts)}; "
+        "scene": f"{made.scene or 'scene'}, {steps_made(made.iteration or 0, bool(made.origin))}, {_views(counts)}; "
         f"{counts.visible_gaussians:,} Gaussians in sight",
         "steepest": _end(ends.max),
         "negative" if (ends.min.value or 0.0) < 0 else "lowest": _end(ends.min),
@@ -36,13 +36,13 @@ def summary(data: ProbeRecord, report: Path) -> list[str]:
     return [f"{name:<9} {text}" for name, text in lines.items() if text]
 
 
-def steps_made(steps: int | None, foreign: bool) -> str:
+def steps_made(steps: int, foreign: bool) -> str:
     """Number of steps of the training; a file of another tool, foreign, may not say it.
 
     >>> steps_made(2000, False), steps_made(0, True), steps_made(0, False)
     ('2,000 steps', 'steps not known', '0 steps')
     """
-    return "steps not known" if foreign and not steps else f"{steps or 0:,} steps"
+    return "steps not known" if foreign and not steps else f"{steps:,} steps"
 
 
 def guess(origin: Mapping[str, Any] | None) -> list[str]:
