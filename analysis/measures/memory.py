@@ -91,7 +91,7 @@ def _size(size: float) -> str:
     >>> _size(0), _size(1234), _size(2.5e9)
     ('0 kB', '1.23 kB', '2.5 GB')
     """
-    unit, name = next(((each, name) for each, name in ((1e9, "GB"), (1e6, "MB")) if size >= each), (1e3, "kB"))
+    unit, name = next(((each, name) for each, name in ((1e9, "GB"), (1e6, "MB")) if size >= 0.9995 * each), (1e3, "kB"))
     return f"{size / unit:.3g} {name}"
 
 

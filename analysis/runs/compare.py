@@ -177,7 +177,8 @@ def _apart(runs: Sequence[Run]) -> list[str]:
     found = [made for run in runs if (made := run.data.provenance.fingerprint)]
     lines = []
     for run, made in zip(runs, found, strict=True):
-        trained = {name: run.checkpoint.scene.views[name] for name in made.data}
+        views = run.checkpoint.scene.views
+        trained = {name: views[name] for name in made.data if name in views}
         for words, views in (("of its training", trained), (f"of {runs[0].label}", found[0].data)):
             if moved := changes({name: view for name, view in views.items() if name in made.data}, made.data):
                 lines.append(f"The views of {run.label}'s probe are not those {words}: {in_short(moved)}.")

@@ -124,19 +124,25 @@ def _of_map(run: Path, state: str) -> dict[str, float]:
     return row | {"opacity_one_view": _number(found.opacity_one_view)}
 
 
+PAPERS = {"stablegs": {"viewpoints": "all"}}  # what a paper's text says where the default is another
+
+
 def method_name(config: TrainConfig, start: Source = "scene") -> str:
     """The method, its start and protocol where they are not the default, and its settings that differ from their defaults.
 
-    Defaults are those scaled to the length of the training; the setting `depths`, of input files, is not compared.
+    Defaults are those scaled to the length of the training, but for PAPERS; the setting `depths`, of input files, is not
+    compared.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS
-    >>> method_name(TrainConfig(500, method=StableGS(vsp_weight=0.0, warm_up=50))), method_name(TrainConfig(), "dense")
-    ('stablegs vsp_weight=0', '3dgs start=dense')
+    >>> method_name(TrainConfig(500, method=StableGS(vsp_weight=0.0, warm_up=50, viewpoints="all")))
+    'stablegs vsp_weight=0'
+    >>> method_name(TrainConfig(), "dense")
+    '3dgs start=dense'
     """
     name, preset = config.method.name, presets(config.method.name, config.protocol)
     usual = TrainConfig(iterations=config.iterations, method=type(config.method)())
     usual = overridden(usual, {key: value for key, value in preset.items() if key != "start"})
-    published = leaves(asdict(usual.method.scaled(usual).method))
+    published = leaves(asdict(usual.method.scaled(usual).method)) | PAPERS.get(name, {})
     settings = leaves(asdict(config.method))
     changed = [
         f"{key}={_text(value)}" for key, value in settings.items() if value != published[key] and key != "depths"

@@ -131,7 +131,7 @@ def photometric_step(step: Step) -> float:
 
     # update, then clone, split and prune
     training.descend(found.gradient, step.number)
-    if step.number == len(step.views) and not bool(training.adam.first.flat.any()):
+    if base.loss and step.number == len(step.views) and not bool(training.adam.first.flat.any()):
         raise InputError(
             f"expected a gradient, got exactly 0 in the first {step.number} steps, one on each view: what they show does not "
             "depend on the Gaussians; look at their opacities and at the scene's scale"

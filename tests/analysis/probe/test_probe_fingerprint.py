@@ -86,7 +86,7 @@ def test_what_changed_since_the_training_is_said_before_anything_is_measured(the
     asked: list[str] = []
 
     def measure(*given, **_):
-        asked.append(given[5])
+        asked.append(given[6])
         raise InputError("measured")
 
     monkeypatch.setattr("analysis.probe.command.measure", measure)
@@ -106,7 +106,7 @@ def test_stages_are_kept_for_the_same_data_question_state_and_formulas_alone(the
     asked: list[str] = []
 
     def measure(*given, **_):
-        asked.append(given[5])
+        asked.append(given[6])
         raise InputError("measured")
 
     monkeypatch.setattr("analysis.probe.command.measure", measure)

@@ -509,7 +509,7 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     tmp_path, index, settings, reason, command
 ):
     data, arrays = synthetic()
-    data["anisotropy"][index] = {"value": 0.7777, "low": 0.5, "high": None, "note": "open"}
+    data["anisotropy"][index] = {"value": 0.73519, "low": 0.5, "high": None, "note": "open"}
     data["eigenvalues"]["min"] |= {"reason": reason, "matvecs": 15}
     asked = {f"settings.{name}": value for name, value in settings.items()}
     data["provenance"] |= {"fingerprint": plain(Fingerprint({}, asked, "00"))}
@@ -518,10 +518,10 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     assert line.text.startswith(f"{index.replace('_', ' ').capitalize()}: – (at least 0.500); ")
     assert line.text.endswith(f"{command}." if command else "no more products resolve it.")
     text = Page(page(tmp_path / "probe", data, arrays)).text
-    assert "77" not in text and "0.500" in text
+    assert not re.search(r"735|0\.74", text) and "0.500" in text
     console = Console(width=120, file=StringIO())
     console.print(probe_table(probe_of(data), 120))
-    assert "77" not in console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+    assert not re.search(r"735|0\.74", console.file.getvalue())  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution(tmp_path):

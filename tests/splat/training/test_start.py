@@ -305,5 +305,7 @@ def test_the_source_of_the_points_can_be_chosen(monkeypatch: pytest.MonkeyPatch)
         "splat.scenes.sfm.plane_sweep.dense_points", lambda chosen, near: elsewhere if near == [3.0] * 3 else None
     )
     assert torch.equal(start(with_points, "dense"), triangulated)
-    with pytest.raises(ValueError, match="scene with points, s has none; start from triangulated or random ones"):
+    with pytest.raises(
+        ValueError, match="scene with points, s has none; start from dense, triangulated or random ones"
+    ):
         start(without, "points")
