@@ -43,7 +43,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     with style():
         figure = new_figure(4.4, PAGE)
         index = figure.add_subplot(2, 3, 1)
-        index_over_steps(index, measured, dict(zip(names, RUNS, strict=False)), "literal")
+        index_over_steps(index, measured, dict(zip(names, RUNS, strict=False)), "eigenvalue_ratio")
         index.set(xlabel="step", ylabel="|λmax / λmin|", title="Anisotropy index")
         index.xaxis.set_major_locator(step_ticks())
         index.grid(True)
@@ -61,7 +61,9 @@ def draw(runs: Sequence[Path]) -> Figure:
         handles = [figure.axes[-1].lines[i] for i in (1, 2, 0)]
         for line, name in zip(handles, (*names, BEGINNING), strict=True):
             line.set_label(literal(name))
-        figure.legend(handles=[*handles, *marker_words(measured, "literal")], loc="outside lower center", ncols=4)
+        figure.legend(
+            handles=[*handles, *marker_words(measured, "eigenvalue_ratio")], loc="outside lower center", ncols=4
+        )
     return figure
 
 

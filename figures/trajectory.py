@@ -26,7 +26,7 @@ from figures.scripts import table_script
 from figures.style import BLACK, RUNS, literal, new_figure, style
 from landscape.errors import InputError
 
-INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
+INDICES = {"eigenvalue_ratio": "|λmax / λmin|", "participation_ratio": "participation ratio"}
 UNITS = "traces, eigenvalues: loss per squared stored unit"
 PANEL = 1.12  # inches of height
 LEGEND_LINE = 0.14

@@ -29,8 +29,8 @@ from landscape.errors import InputError
 from splat.model.untrusted import read_arrays
 
 SCORES = {
-    "rise": ("rise of the loss", VERMILION),
-    "rise_l2": ("rise of the squared error", ORANGE),
+    "removal_error": ("removal error, loss", VERMILION),
+    "removal_error_l2": ("removal error, squared", ORANGE),
     "log_det_11": ("log det, 11 x 11", BLUE),
     "log_det_6": ("log det, 6 x 6 (PUP)", SKY),
     "gn_diagonal": ("Gauss-Newton diagonal", GREEN),

@@ -9,7 +9,7 @@ returns a frozen result that carries its error.  Bad arguments, and products tha
                   `gauss_newton_traces`, ... by its backward passes alone; `renderer_eigenpairs`; `Monitor` of a training
     checks        `check_operator`, `check_gradient`, `check_objective`: is it the Hessian?
     estimators    `estimate_traces`, `estimate_diagonal`, `extreme_eigenpairs`, `spectral_density`
-    indices       `anisotropy` of ends and a density; `families`: of the whole operator and of each of its blocks
+    indices       `anisotropy` of ends and a density; `block_anisotropies`: of the whole operator and of each of its blocks
     slices        `evaluate_slice` along `random_directions`, `gradient_direction`, ...; `finite_probe` at finite steps
     processes     `Ranks`, `DistributedOperator`
 """

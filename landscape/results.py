@@ -55,7 +55,7 @@ def _plain(value: Any) -> Any:
     return finite_or_none(value) if isinstance(value, float) else value
 
 
-class Brief:
+class ShortRepr:
     """A dataclass, made with repr=False, that fits on three lines of a terminal: of large parts their kind and shape."""
 
     def __repr__(self) -> str:

@@ -112,9 +112,9 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
             },
         },
         "anisotropy": {
-            "literal": {"value": top / bottom, "low": -143.0, "high": -139.0, "note": ""},
-            "saddle": {"value": -top / bottom, "low": 139.0, "high": 143.0, "note": ""},
-            "share": {"value": None, "low": None, "high": None, "note": NEEDS_DENSITY},
+            "eigenvalue_ratio": {"value": top / bottom, "low": -143.0, "high": -139.0, "note": ""},
+            "negative_ratio": {"value": -bottom / top, "low": 1 / 143.0, "high": 1 / 139.0, "note": ""},
+            "top_mass": {"value": None, "low": None, "high": None, "note": NEEDS_DENSITY},
         },
         "slice": _plane(scale),
         "counts": {

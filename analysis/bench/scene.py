@@ -7,7 +7,7 @@
     linearize           what `LinearizedView` does once
     H v K               a product with K vectors, per vector
     block diagonal      approximate Hessian blocks of all attributes, one pass
-    exact blocks        the same with SSIM's coupling of pixels (on a CPU)
+    exact blocks        the same with SSIM's window (on a CPU)
 
 One code for the CPU and for GPUs: where the workload's Gaussians are decides which kernels run, and a `Meter` measures them.
 """

@@ -51,7 +51,7 @@ from splat.training.checkpoint import Checkpoint, open_checkpoint
 from splat.training.origin.fingerprint import Fingerprint
 
 if TYPE_CHECKING:
-    from analysis.measures.families import FamilyOptions
+    from analysis.measures.per_attribute import PerAttributeOptions
 
 CHECK_FAILED = 1
 DRAWING = 8.0  # seconds of the time limit that are left for the record and its pictures
@@ -91,7 +91,7 @@ def _run(
     say(*guessed, _introduction(scene, checkpoint, objective), console=console)
     say(_expected(objective, settings, after), console=console)
     made = asked(options, checkpoint)
-    identity = f"{made.but('settings.families').digest} {device}"  # families are measured after what is kept
+    identity = f"{made.but('settings.per_attribute').digest} {device}"  # families are measured after what is kept
     # the folder is opened first, so that one that cannot be written is refused before anything is measured
     with (
         record_folder(out) if writes else nullcontext() as folder,
@@ -121,12 +121,12 @@ def _run(
     return CHECK_FAILED if options.strict and failed else 0
 
 
-def _require_same_in_all_processes(limit: float, families: "FamilyOptions | None") -> None:
+def _require_same_in_all_processes(limit: float, families: "PerAttributeOptions | None") -> None:
     if isfinite(limit):  # the processes' clocks differ, and all must measure the same
         raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {limit:g}")
     if families is not None:
         raise InputError(
-            "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
+            "expected no --per-attribute, --split-control or --metric under torchrun, got one; run it in one process"
         )
 
 
@@ -145,14 +145,14 @@ def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[No
 def asked(options: ProbeOptions, checkpoint: Checkpoint) -> Fingerprint:
     """What the numbers of a probe with these options are about.  checkpoint: thinned as they say."""
     families = _family_options(options)
-    settings = asdict(_settings(options)) | ({} if families is None else {"families": asdict(families)})
+    settings = asdict(_settings(options)) | ({} if families is None else {"per_attribute": asdict(families)})
     return checkpoint.fingerprint(settings, options.seed, LossSettings() if options.loss == "3dgs" else None)
 
 
 def _with_families(
     data: ProbeRecord,
     arrays: Arrays,
-    options: "FamilyOptions",
+    options: "PerAttributeOptions",
     objective: SceneObjective,
     checkpoint: Checkpoint,
     generator: torch.Generator,
@@ -160,11 +160,11 @@ def _with_families(
     ends: EigenEnds,
 ) -> ProbeRecord:
     """Measure the families; returns the record with them, and adds theirs to the arrays."""
-    from analysis.measures.families import measure_families
+    from analysis.measures.per_attribute import measure_per_attribute
 
     training, stream = checkpoint.training, spawn(generator)
-    families = measure_families(objective, training, options, stream, stages.stage, ends)
-    arrays["families"] = families.arrays()
+    families = measure_per_attribute(objective, training, options, stream, stages.stage, ends)
+    arrays["per_attribute"] = families.arrays()
     return families.added_to(data)
 
 
@@ -227,13 +227,13 @@ def _settings(options: ProbeOptions) -> ProbeSettings:
     return replace(settings, slice_rise=options.slice_rise, power_apart=options.power, **changes)
 
 
-def _family_options(options: ProbeOptions) -> "FamilyOptions | None":
-    """Options of the families; None without --families, --split-control and --metric."""
-    if not (options.families or options.split_control or options.metric != "parameters"):
+def _family_options(options: ProbeOptions) -> "PerAttributeOptions | None":
+    """Options of the families; None without --per-attribute, --split-control and --metric."""
+    if not (options.per_attribute or options.split_control or options.metric != "parameters"):
         return None
-    from analysis.measures.families import FamilyOptions  # slow to import
+    from analysis.measures.per_attribute import PerAttributeOptions  # slow to import
 
-    return FamilyOptions(options.metric, options.split_control, seconds=options.family_seconds)
+    return PerAttributeOptions(options.metric, options.split_control, seconds=options.per_attribute_seconds)
 
 
 def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjective) -> str:
@@ -264,7 +264,7 @@ def _conclude(data: ProbeRecord, out: Path, verbose: bool, guessed: Sequence[str
         console.print(probe_table(data, console.width))
         pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
         say(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", console=console)
-    if data.families:
+    if data.per_attribute:
         console.print(family_table(data))
     for line in remarks(data, verbose):
         console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False, markup=False)

@@ -2,7 +2,7 @@
 
     linearise           derivatives of every view, the diagonal block of every Gaussian in H, a first render
     checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
-    traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled where that
+    traces              of each attribute's block: exact, but for SSIM's window, which is sampled where that
                         is cheaper
     eigenvalues         the two largest and the smallest, from the start vectors of `splat.curvature.block_eigenvectors`
     renders             the second difference of the loss along the eigenvectors of both ends, at steps that double, from a part
@@ -151,7 +151,7 @@ def _linearised(objective: SceneObjective, settings: ProbeSettings, report: Prog
     report(1, 1, views)
     value = objective.loss(objective.active.flat)
     objective.approximate_blocks  # noqa: B018 (cached; its kernels compile in this stage)
-    if settings.block_coupling or not settings.trace_samples:
+    if settings.block_ssim_window or not settings.trace_samples:
         _compile_blocks(objective)
     return _Point(objective, hessian, CountingOperator(hessian), settings, gradient, value)
 
@@ -311,8 +311,8 @@ def _depth(at: _Point, accuracy: TraceSettings, generator: torch.Generator, repo
 
 
 def _shares(at: _Point, generator: torch.Generator, report: Progress, _: list[str]) -> list[BlockShare]:
-    samples, coupled = at.settings.block_samples, at.settings.block_coupling
-    return block_shares(at.objective, generator, samples, report, coupled=coupled)
+    samples, ssim_window = at.settings.block_samples, at.settings.block_ssim_window
+    return block_shares(at.objective, generator, samples, report, ssim_window=ssim_window)
 
 
 def _plane(

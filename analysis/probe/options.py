@@ -47,20 +47,20 @@ class ProbeOptions:
     slice_rise: float = 0.001
     """What a curvature unit is: the step within which the curvature alone changes the loss by this share of it.
     The slice reaches 3 units each way."""
-    families: FlagCreatePairsOff[bool] = False
+    per_attribute: FlagCreatePairsOff[bool] = False
     """Also the anisotropy indices of all attributes together and of each, for the Hessian and for Gauss-Newton.
     Takes about four times as many products as the rest.  Not under torchrun."""
     split_control: FlagCreatePairsOff[bool] = False
-    """The families, and the same of the scene with every Gaussian split in two: what their number alone does to the indices.
-    Takes about 2.5 times as long as the families alone."""
+    """The same, and that of the scene with every Gaussian split in two: what their number alone does to the indices.
+    Takes about 2.5 times as long as --per-attribute alone."""
     metric: Literal["parameters", "scene", "optimiser"] = "parameters"
-    """Units in which the families compare curvature.
+    """Units in which --per-attribute compares curvature.
     parameters: as stored.
     scene: positions in units of the scene's size (the median depth where all views face one way, else the cameras' mean
     distance from their centre), the rest as stored.
     optimiser: each parameter in units of its learning rate at the first step.
-    Any but parameters measures the families, as --families does."""
-    family_seconds: float = 1800.0
-    """Time for the families together, in seconds, beside that of --seconds.  inf: no limit."""
+    Any but parameters implies --per-attribute."""
+    per_attribute_seconds: float = 1800.0
+    """Time for --per-attribute, in seconds, beside that of --seconds.  inf: no limit."""
     memory: MostMemory = None
     foreign: Foreign = field(default_factory=ForeignOptions)

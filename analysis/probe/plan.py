@@ -68,7 +68,7 @@ def plan_of(settings: ProbeSettings, product: float, render: float, after: Expec
         work["finite probe"] = (count, 0, count)
     if settings.depth is None:
         del work["depth"]
-    if settings.block_coupling:
+    if settings.block_ssim_window:
         work["block shares"] = (0, 24, 0)  # exact blocks take longest
     found = {
         name: Work(products * product + renders * render, units)

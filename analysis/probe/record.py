@@ -19,7 +19,7 @@ from analysis.records import schema
 from analysis.records.provenance import Origin, Provenance, provenance
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
 from analysis.records.tables import NEEDS_DENSITY
-from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, literal
+from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, eigenvalue_ratio
 from landscape.results import Bracket, finite_or_none, sampling_error
 from landscape.slices.finite_probe import FiniteProbe
 from landscape.slices.slice import Slice as Grid
@@ -172,7 +172,7 @@ def _trace(trace: TraceEstimate, left_out: LeftOut | None, rank: int | None) -> 
 def _block_share(found: BlockShare) -> schema.BlockShare:
     blocks, attributes, diagonal = map(finite_or_none, (found.blocks, found.attributes, found.diagonal))
     return schema.BlockShare(
-        operator="gauss-newton" if found.gauss_newton else "hessian", coupled=found.coupled, blocks=blocks,
+        operator="gauss-newton" if found.gauss_newton else "hessian", ssim_window=found.ssim_window, blocks=blocks,
         attributes=attributes, diagonal=diagonal, norm=found.norm, relative_error=found.error, samples=found.samples,
     )  # fmt: skip
 
@@ -239,16 +239,16 @@ def _anisotropy(found: Measured) -> schema.Anisotropy:
     known = {name: getattr(family, name) for name in schema.INDICES}
     indices = schema.Anisotropy(**{name: index_of(bracket) if bracket else left_out for name, bracket in known.items()})
     if found.power is not None:
-        indices.literal = literal_index(found.ends, found.power)
+        indices.eigenvalue_ratio = paper_index(found.ends, found.power)
     return indices
 
 
-def literal_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
+def paper_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
     """The paper's index: of its power iteration where that converged, else of the ends; with the bracket of the ends.
 
     It has converged where it lies in the bracket.  An unbounded bracket excludes nothing: there it must not end at a budget.
     """
-    certain, paper, method = literal(ends), literal(power), ends.method.capitalize()
+    certain, paper, method = eigenvalue_ratio(ends), eigenvalue_ratio(power), ends.method.capitalize()
     value, note = paper.value, f"by power iteration, as the paper takes it; the bracket is that of {method}"
     bounded = isfinite(certain.low) and isfinite(certain.high)
     ran_out = any(end.reason.endswith("budget") for end in (power.largest, power.smallest))

@@ -26,7 +26,7 @@ class ProbeSettings:
         noise of a render.
     halvings: of the optimiser's step, to the shortest at which the loss is rendered along both ends.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
-    block_samples: of the share of H within the Gaussians' blocks; block_coupling: with SSIM's coupling of pixels, too.
+    block_samples: of the share of H within the Gaussians' blocks; block_ssim_window: with SSIM's window, too.
     memory: GiB for the vectors of a basis.
     """
 
@@ -49,7 +49,7 @@ class ProbeSettings:
     depth_steps: tuple[float, ...] = DEPTH_STEPS
     noise_points: int = NOISE_POINTS
     block_samples: int = 8
-    block_coupling: bool = True
+    block_ssim_window: bool = True
     memory: float = 2.0
 
     def __post_init__(self) -> None:
@@ -80,5 +80,5 @@ class ProbeSettings:
             halvings=2,
             depth=None,
             block_samples=4,
-            block_coupling=False,
+            block_ssim_window=False,
         )

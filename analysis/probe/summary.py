@@ -124,7 +124,7 @@ def _step(data: ProbeRecord) -> str:
 
 def _spread(data: ProbeRecord) -> str:
     """The participation ratio and the steepest direction's part, as far as the density knows them."""
-    ratio, share, parts = data.anisotropy.effective_rank, data.anisotropy.share, []
+    ratio, share, parts = data.anisotropy.participation_ratio, data.anisotropy.top_mass, []
     if ratio and ratio.value is not None and not is_loose(ratio):
         parts.append(
             f"a participation ratio of {rough(ratio.value)} among {data.counts.active_parameters:,} directions"

@@ -1,4 +1,4 @@
-"""Sentences on a record: which attribute carries the curvature, saddle or basin, how anisotropic, what was skipped.
+"""Sentences on a record: which attribute carries the curvature, its sign, how anisotropic, what was skipped.
 
 Every sentence follows from numbers of the record and their errors alone; where an error does not decide, it says so.
 """
@@ -64,7 +64,7 @@ def findings(data: ProbeRecord) -> list[Line]:
 
 
 def headline(data: ProbeRecord) -> list[Line]:
-    """Three sentences at most: basin or saddle, the attribute that carries the curvature, the steepest direction."""
+    """Three sentences at most: the signs of curvature, the attribute that carries the curvature, the steepest direction."""
     found = [*_of_ends(data), *_of_traces(data)[:1], *_of_needles(data.eigenvalues.max.lives_on, data.counts)]
     return found[:3]
 
@@ -198,14 +198,12 @@ def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
 def _of_anisotropy(data: ProbeRecord) -> list[Line]:
     """The ratio of both ends, unless renders refute one, and the part of the steepest direction."""
     lines, family = [], data.anisotropy
-    share, saddle = family.share, family.saddle if data.eigenvalues.stand else None
-    text = "The steepest direction up is {} times as curved as the steepest down{}."
-    if saddle and _is_finite(saddle.value) and not is_loose(saddle):
-        lines.append(Line(text.format(quantity(saddle.value), _bracket(saddle))))
-    elif saddle and saddle.low is not None and 0 < saddle.low < math.inf:
-        lines.append(Line(text.format(f"at least {quantity(saddle.low)}", _in_brackets(saddle.note))))
-    elif saddle:
-        text = f"The ratio of the two ends of the spectrum is not determined{_in_brackets(saddle.note)}."
+    share, ratio = family.top_mass, family.negative_ratio if data.eigenvalues.stand else None
+    text = "The steepest direction down is {} times as curved as the steepest up{}."
+    if ratio and _is_finite(ratio.value) and not is_loose(ratio) and ratio.value:
+        lines.append(Line(text.format(quantity(ratio.value), _bracket(ratio))))
+    elif ratio and ratio.high:
+        text = f"The ratio of the two ends of the spectrum is not determined{_in_brackets(ratio.note)}."
         lines.append(Line(text, "caution"))
     if share and _is_finite(share.value) and not is_loose(share):
         text = f"The steepest direction alone holds {share.value:.2%} of all absolute curvature"
@@ -242,7 +240,7 @@ def remedy(data: ProbeRecord, name: str) -> str:
     if "matvec budget" in reasons:
         spent = ends.min.matvecs or 1
         return f"more products resolve it: {_with(command, '--end-products', 4 * spent)}"
-    if name in ("share", "effective_rank"):
+    if name in ("top_mass", "participation_ratio"):
         products = int((made.fingerprint.question if made.fingerprint else {}).get("settings.density_matvecs") or 108)
         return f"a longer density narrows it: {_with(command, '--density-products', 4 * products)}"
     return "the end is within its error of 0, and no more products resolve it"
@@ -327,7 +325,7 @@ def _of_block_shares(shares: Sequence[schema.BlockShare]) -> list[Line]:
     names, parts = {"hessian": "the Hessian", "gauss-newton": "Gauss-Newton"}, []
     for one in shares:
         if one.blocks is not None and one.diagonal is not None:
-            operator = names[one.operator] + ("" if one.coupled else " without the coupling of pixels by SSIM")
+            operator = names[one.operator] + ("" if one.ssim_window else " without SSIM's window")
             share = measured(100 * one.blocks, 100 * one.blocks * one.relative_error)
             parts.append(f"of {operator} {share}% ({one.diagonal:.0%} on the diagonal)")
     text = "Of the sum of all squared entries, this lies within the Gaussians' own blocks (11 x 11, and the diagonal of SH): "

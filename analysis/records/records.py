@@ -28,7 +28,7 @@ ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
     "eigenvectors": {"largest": "parameters k", "smallest": "parameters m?"},
     "traces": {"*": "probes?"},
-    "families": {"*": "starts steps?"},
+    "per_attribute": {"*": "starts steps?"},
     "slice": {"x": "nx", "y": "ny?", "loss": "grid", "model": "grid?", "evaluated": "grid?", "crossed": "grid?"},
     "directions": {"vectors": "parameters d"},
 }
@@ -38,7 +38,7 @@ spectrum      ritz_values, residuals: approximate eigenvalues, the two ends amon
               nodes, weights: a quadrature for each start vector; known eigenvalues are among the nodes of each
 eigenvectors  unit vectors of the k largest and the m smallest eigenvalues, of the Gaussians in sight
 traces        ATTRIBUTE: the samples whose mean is the trace
-families      SCENE.OPERATOR.BLOCK.nodes and .weights: the quadrature of each family's density
+per_attribute SCENE.OPERATOR.BLOCK.nodes and .weights: the quadrature of each family's density
 slice         x, y: increasing steps along the directions; loss: L on the grid, [nx, ny] or, along a line, [nx]; model: the
               quadratic model there; evaluated (boolean): true where loss is rendered, false where interpolated (absent: all are
               rendered); crossed (boolean): true where the order of the splats or the set of visible ones is not that of the
@@ -135,7 +135,7 @@ class ProbeRecord(Struct, kw_only=True):
     notes: list[str] = []
     skipped: dict[str, Skip] = {}
     provenance: Provenance
-    families: Maybe[list[schema.Family]] = UNSET
+    per_attribute: Maybe[list[schema.BlockAnisotropy]] = UNSET
     split_control: Maybe[schema.SplitControl] = UNSET
     timing: dict[str, float]
     arrays: Shapes = {}

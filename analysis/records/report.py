@@ -135,7 +135,7 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
         pictures=pictures.result(),
         where=places.result(),
         splats=f"../{SPLATS}" if (run / SPLATS).is_file() else "",
-        families=family_lines(data),
+        per_attribute=family_lines(data),
         indices=INDICES,
         surface=surface,
         plotly_js=packed.result() if packed else "",
@@ -202,7 +202,7 @@ def numbers(data: ProbeRecord, mapped: MapRecord | None = None) -> list[dict[str
         compared = rendered.get((end.value or 0.0) > 0, "")
         found.append({"value": measured(end.value, end.residual), "words": f"{words}, per stored unit²{compared}"})
     found += _steepest_attribute(data)
-    if (index := data.anisotropy.literal) and ends.stand:
+    if (index := data.anisotropy.eigenvalue_ratio) and ends.stand:
         cell = bracketed(None if is_open(index) else index)
         value, words = cell.value, "λ max / λ min"
         if index.value and index.value < 0:

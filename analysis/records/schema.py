@@ -23,7 +23,7 @@ Number = float | None
 Count = Annotated[int, Meta(ge=0)]
 Sign = Literal["positive", "negative", "zero", "undetermined"]
 Operator = Literal["hessian", "gauss-newton"]
-IndexName = Literal["literal", "saddle", "share", "effective_rank"]
+IndexName = Literal["eigenvalue_ratio", "negative_ratio", "top_mass", "participation_ratio"]
 
 
 ROUND_OFF = 1e-6  # by which numbers may leave their order or [0, 1]
@@ -263,20 +263,20 @@ class Index(Struct, kw_only=True):
 class Anisotropy(Named[Index], kw_only=True):
     """The indices of `landscape.spectrum.anisotropy`."""
 
-    literal: Maybe[Index] = UNSET
-    saddle: Maybe[Index] = UNSET
-    share: Maybe[Index] = UNSET
-    effective_rank: Maybe[Index] = UNSET
+    eigenvalue_ratio: Maybe[Index] = UNSET
+    negative_ratio: Maybe[Index] = UNSET
+    top_mass: Maybe[Index] = UNSET
+    participation_ratio: Maybe[Index] = UNSET
 
     def __post_init__(self) -> None:
-        """All but `literal`, whose denominator may be 0, are in brackets; a share is one, a rank above 0."""
+        """All but `eigenvalue_ratio`, whose denominator may be 0, are in brackets; a mass is at most 1, none is negative."""
         for name, found in self.items():
-            if name != "literal":
+            if name != "eigenvalue_ratio":
                 require_order(low=found.low, value=found.value, high=found.high)
-            if name in ("share", "effective_rank"):
+            if name != "eigenvalue_ratio":
                 _require_error(name, found.value)
-            if name == "share":
-                require_order(share=found.value, one=1.0)
+            if name == "top_mass":
+                require_order(top_mass=found.value, one=1.0)
 
 
 INDICES = Anisotropy.__struct_fields__
@@ -355,13 +355,13 @@ class Depth(Struct, kw_only=True):
 class BlockShare(Struct, kw_only=True):
     """Share of an operator's squared entries within the diagonal blocks of Gaussians (`splat.curvature.scores.shares`).
 
-    coupled: with SSIM's coupling of pixels.  blocks: share within the 11 x 11 of geometry and the diagonal of SH; attributes:
+    ssim_window: with SSIM's window.  blocks: share within the 11 x 11 of geometry and the diagonal of SH; attributes:
     within the attributes' blocks of these; diagonal: on the diagonal; None where the operator is 0.  norm: squared Frobenius
     norm.  relative_error: relative standard error of the norm and of each share.  samples: random vectors.
     """
 
     operator: Operator
-    coupled: bool
+    ssim_window: bool
     blocks: Number
     attributes: Number
     diagonal: Number
@@ -370,8 +370,8 @@ class BlockShare(Struct, kw_only=True):
     samples: Count
 
 
-class Family(Struct, kw_only=True):
-    """The anisotropy of one diagonal block of one operator (`analysis.measures.families`).
+class BlockAnisotropy(Struct, kw_only=True):
+    """The anisotropy of one diagonal block of one operator (`analysis.measures.per_attribute`).
 
     metric, unit: units in which curvature is compared, by name and in words.  block: "all" or an attribute.  split: whether of
     the split scene.  dim: rows of the block; rank: dim less the exact null space.  beyond: distance beyond the Ritz values

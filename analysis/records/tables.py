@@ -13,7 +13,7 @@ from rich.table import Table
 from analysis.records.findings import attribute_name, is_open, is_wide
 from analysis.records.quantities import HARD, PLUS_MINUS, UNDETERMINED, apart, limits, measured, quantity
 from analysis.records.records import Check, Counts, ProbeRecord
-from analysis.records.schema import INDICES, BlockShare, Depth, Effect, End, Family, Index, Number
+from analysis.records.schema import INDICES, BlockAnisotropy, BlockShare, Depth, Effect, End, Index, Number
 
 ENDS = {
     "max": "largest eigenvalue",
@@ -151,7 +151,7 @@ def _depth_rows(depth: Depth | None) -> Iterator[Row]:
 def _share_rows(shares: Iterable[BlockShare]) -> Iterator[Row]:
     """Rows of the shares of operators' squared entries."""
     for one in shares:
-        coupling = "" if one.coupled else ", no coupling"
+        coupling = "" if one.ssim_window else ", without SSIM's window"
         about = f"attributes' blocks {quantity(one.attributes)}, diagonal {quantity(one.diagonal)}"
         error = None if one.blocks is None else one.blocks * one.relative_error
         yield f"in blocks: {OPERATOR_NAMES[one.operator]}{coupling}", measured(one.blocks, error), about
@@ -195,7 +195,7 @@ class FamilyLine:
 
 def family_lines(data: ProbeRecord) -> list[FamilyLine]:
     """Lines of every operator and block: the trained scene's, the split scene's, and the factors between them."""
-    rows, control = data.families or [], data.split_control
+    rows, control = data.per_attribute or [], data.split_control
     lines = []
     for row in (row for row in rows if not row.split):
         lines += [_line(each, bool(control)) for each in rows if _key(each) == _key(row)]
@@ -209,12 +209,12 @@ def family_lines(data: ProbeRecord) -> list[FamilyLine]:
 
 
 def family_table(data: ProbeRecord) -> Table:
-    """The indices of all lines, brackets below the values, within 80 columns; without saddle, which is -literal."""
-    title = escape(f"Anisotropy by attribute ({data.families[0].unit})") if data.families else None
+    """The indices of all lines, brackets below, within 80 columns; without negative_ratio, -1 / eigenvalue_ratio."""
+    title = escape(f"Anisotropy by attribute ({data.per_attribute[0].unit})") if data.per_attribute else None
     look: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False, "show_edge": False}
     table = Table(title=title, caption=CAPTION, **look)
     table.add_column("", no_wrap=True)
-    shown = [i for i, name in enumerate(INDICES) if name != "saddle"]
+    shown = [i for i, name in enumerate(INDICES) if name != "negative_ratio"]
     for i in shown:
         table.add_column(INDICES[i].replace("_", " "), justify="right", no_wrap=True)
     operator = ""
@@ -266,7 +266,7 @@ def factor(effect: Effect | None) -> Cell:
     return cell if cell.value == UNDETERMINED else replace(cell, value=f"× {cell.value}")
 
 
-def _line(row: Family, several: bool) -> FamilyLine:
+def _line(row: BlockAnisotropy, several: bool) -> FamilyLine:
     ends = _end(row.lambda_max, row.beyond, 1), _end(row.lambda_min, row.beyond, -1)
     indices = tuple(bracketed(getattr(row.indices, name) or None) for name in INDICES)
     scene = "" if not several else "split" if row.split else "trained"
@@ -286,5 +286,5 @@ def _end(end: End, beyond: Number, outwards: int) -> Cell:
     return Cell("not reached", " … ".join((inner, outer)[::outwards]), reason)
 
 
-def _key(row: Family | Effect) -> tuple[str, str]:
+def _key(row: BlockAnisotropy | Effect) -> tuple[str, str]:
     return row.operator, row.block

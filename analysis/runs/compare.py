@@ -150,8 +150,8 @@ def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
     lines = [f"The {what} are not the same." if what.endswith("s") else f"The {what} is not the same."
              for what, of in settings.items()
              if any(of(run) != of(runs[0]) for run in runs) and not (seeds and what == "seed")]  # fmt: skip
-    if len({row.unit for run in runs for row in run.data.families or ()}) > 1:
-        lines.append("The units of the families are not the same.")
+    if len({row.unit for run in runs for row in run.data.per_attribute or ()}) > 1:
+        lines.append("The units of --per-attribute are not the same.")
     lines += _apart(runs)
     said: list[tuple[Run, str]] = []
     for run in runs:
@@ -203,7 +203,7 @@ def split_controls(runs: Sequence[Run]) -> list[str]:
     lines = []
     for run in runs:
         if control := run.data.split_control:
-            seen = next((row.gaussians for row in run.data.families or () if row.split), control.gaussians)
+            seen = next((row.gaussians for row in run.data.per_attribute or () if row.split), control.gaussians)
             lost = (
                 f", and {control.gaussians - seen:,} of the halves touch no pixel." if seen < control.gaussians else "."
             )

@@ -23,7 +23,7 @@ from splat.model.typed import leaves
 from splat.training.checkpoint import Checkpoint
 from splat.training.state import MethodSettings
 
-FAMILIES = "families"  # a section that only the page and the file show
+FAMILIES = "per_attribute"  # a section that only the page and the file show
 DEPTH = "depth over lateral"
 
 
@@ -113,7 +113,8 @@ def _depth(runs: Sequence[Run]) -> Iterable[Row]:
 def _families(runs: Sequence[Run]) -> Iterable[Row]:
     """Rows of every operator and block that a run has families of."""
     of_runs: list[dict[tuple[Operator, str], Anisotropy]] = [
-        {(row.operator, row.block): row.indices for row in run.data.families or () if not row.split} for run in runs
+        {(row.operator, row.block): row.indices for row in run.data.per_attribute or () if not row.split}
+        for run in runs
     ]
     for operator, block in dict.fromkeys(key for rows in of_runs for key in rows):
         for name in INDICES:

@@ -20,7 +20,7 @@ from landscape.errors import InputError
 from splat.training.checkpoint import Checkpoint
 
 TOLD = ("held-out views", "trace", "spectrum", "anisotropy")  # sections whose differences are told
-MORE = {"saddle": 1, "share": 1, "effective rank": -1}  # the sign of an index where curvature is less even
+MORE = {"top mass": 1, "participation ratio": -1}  # the sign of an index where curvature is less even
 SPREADS = 2.0
 
 

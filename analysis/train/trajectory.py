@@ -24,8 +24,8 @@ Columns:
     matvecs                products H v of the record
     trace_A                of each attribute's block, with _error (standard error), _low, _high (95%), _dim and _reason
     lambda_max, lambda_min    with _error (residual) and _reason (why the search ended)
-    literal, saddle, share, effective_rank    indices (`landscape.spectrum.anisotropy`), with _low and _high; the
-                           last two of whole records, which have a spectral density
+    eigenvalue_ratio, negative_ratio, top_mass, participation_ratio
+                           indices (`landscape.spectrum.anisotropy`), with _low and _high; the last two of whole records
     of_data, of_question, of_state, of_formulas    digests of what the record is about (`splat.training.origin.fingerprint`)
 """
 

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from landscape.linalg import is_roundoff, norm, orthogonalise, unit_columns
 from landscape.operators.operator import SymmetricOperator, product, require_finite
-from landscape.results import Brief, Progress
+from landscape.results import Progress, ShortRepr
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LanczosFactorization(Brief):
+class LanczosFactorization(ShortRepr):
     """H Q = Q T + r e_m^T after m steps: fewer than asked for if Q spans an invariant subspace (r = 0) or `enough` ended it."""
 
     Q: Float[Tensor, "n m"]

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, product
-from landscape.results import Brief, Progress, plain
+from landscape.results import Progress, ShortRepr, plain
 from landscape.slices.grid_evaluations import Loss
 
 ORDER, NOISE_POINTS = 4, 24  # order of the differences, number of values
@@ -39,7 +39,7 @@ STEPS = tuple(10.0 ** (k / 2) for k in range(-10, 1))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FiniteProbe(Brief):
+class FiniteProbe(ShortRepr):
     """The curvature c(d) at increasing steps d, in multiples of the direction, with its round-off and truncation.
 
     discontinuous: steps d for which +d or -d lies on another smooth piece than the centre; None where the objective does not

@@ -1,12 +1,12 @@
 """Anisotropy of curvatures: indices of the spectrum lambda_1 >= ... >= lambda_n (signed), each with a bracket.
 
-    literal         lambda_1 / lambda_n                            the condition number as the paper writes it, signed
-    saddle          lambda_1 / |lambda_n|                          of an indefinite operator only
-    share           lambda_1 / sum |lambda_i|                      how much of all curvature is in one direction
-    effective_rank  (sum |lambda_i|)^2 / sum lambda_i^2            over how many directions it is spread, 1 to n
+    eigenvalue_ratio     lambda_1 / lambda_n                  the anisotropy index as the paper writes it, signed
+    negative_ratio       |min(lambda_n, 0)| / lambda_1        how far from a minimum: 0 at one
+    top_mass             lambda_1 / sum |lambda_i|            how much of all curvature is in one direction
+    participation_ratio  (sum |lambda_i|)^2 / sum lambda_i^2  over how many directions it is spread, 1 to n
 
 Brackets follow from the eigenvalues' residuals, how far out an end that has not converged may lie, the round-off and the sums'
-intervals (each at a level that gives the quotient 95%).  The literal index is negative for an indefinite operator; where
+intervals (each at a level that gives the quotient 95%).  The eigenvalue ratio is negative for an indefinite operator; where
 lambda_n may be zero it has no upper bound.
 
 What the bracket of an end is certain of is that a true eigenvalue lies within; which one it is, is not.  A search that ends at
@@ -22,28 +22,28 @@ import torch
 
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
-from landscape.results import Bracket, Brief
+from landscape.results import Bracket, ShortRepr
 from landscape.spectrum.absolute_sum import absolute_sum
 from landscape.spectrum.rules import SpectralDensity
 
 
 @dataclass(frozen=True, repr=False)
-class Anisotropy(Brief):
+class Anisotropy(ShortRepr):
     """The index family of `landscape.spectrum.anisotropy`: how unequal the curvatures are.  None: the density it needs
     was not given.
     """
 
-    literal: Bracket
-    saddle: Bracket
-    share: Bracket | None = None
-    effective_rank: Bracket | None = None
+    eigenvalue_ratio: Bracket
+    negative_ratio: Bracket
+    top_mass: Bracket | None = None
+    participation_ratio: Bracket | None = None
 
     def record(self) -> dict[str, object]:
         members = {
-            "literal": self.literal,
-            "saddle": self.saddle,
-            "share": self.share,
-            "effective_rank": self.effective_rank,
+            "eigenvalue_ratio": self.eigenvalue_ratio,
+            "negative_ratio": self.negative_ratio,
+            "top_mass": self.top_mass,
+            "participation_ratio": self.participation_ratio,
         }
         return {name: bracket.record() for name, bracket in members.items() if bracket is not None}
 
@@ -54,16 +54,16 @@ JOINT = 1 - (1 - CONFIDENCE) / 2  # each of two intervals, so that both hold wit
 
 
 def anisotropy(ends: EigenEnds, density: SpectralDensity | None = None) -> Anisotropy:
-    """The whole index family; without a density only `literal` and `saddle`.  ends: at least one pair at each end."""
+    """The whole index family; without a density only the two ratios.  ends: at least one pair at each end."""
     return Anisotropy(
-        literal=literal(ends),
-        saddle=saddle(ends),
-        share=None if density is None else share(ends, density),
-        effective_rank=None if density is None else effective_rank(ends, density),
+        eigenvalue_ratio=eigenvalue_ratio(ends),
+        negative_ratio=negative_ratio(ends),
+        top_mass=None if density is None else top_mass(ends, density),
+        participation_ratio=None if density is None else participation_ratio(ends, density),
     )
 
 
-def literal(ends: EigenEnds) -> Bracket:
+def eigenvalue_ratio(ends: EigenEnds) -> Bracket:
     """lambda_max / lambda_min, signed: StableGS's Eq. (3).
 
     The value is always the quotient of what was found; where lambda_min may be 0, the bracket is that of its modulus instead,
@@ -83,22 +83,19 @@ def literal(ends: EigenEnds) -> Bracket:
     return Bracket(value, min(quotients), max(quotients), note)
 
 
-def saddle(ends: EigenEnds) -> Bracket:
-    """lambda_max / |lambda_min| of an operator with curvatures of both signs; undefined (None) for any other."""
+def negative_ratio(ends: EigenEnds) -> Bracket:
+    """|min(lambda_min, 0)| / lambda_max of an operator with a positive curvature; undefined (None) for any other."""
     top, bottom = _intervals(ends)
-    if bottom[0] >= 0:
-        return Bracket(None, inf, inf, "no negative curvature: the operator is positive semi-definite")
     if top[1] <= 0:
         return Bracket(None, inf, inf, "no positive curvature: the operator is negative semi-definite")
-    if bottom[1] >= 0:
-        return Bracket(None, _at_least(top, bottom), inf, "if lambda_min is negative at all: not resolved from zero")
-    low, high = max(top[0], 0.0) / -bottom[0], top[1] / -bottom[1]
+    low, high = max(-bottom[1], 0.0) / top[1], max(-bottom[0], 0.0) / top[0] if top[0] > 0 else inf
     if top[0] <= 0:
         return Bracket(None, low, high, "if lambda_max is positive at all: not resolved from zero")
-    return Bracket(float(ends.largest.values[0] / -ends.smallest.values[0]), low, high)
+    note = "lambda_min is not resolved from zero" if bottom[0] < 0 <= bottom[1] else ""
+    return Bracket(max(-float(ends.smallest.values[0]), 0.0) / float(ends.largest.values[0]), low, high, note)
 
 
-def share(ends: EigenEnds, density: SpectralDensity) -> Bracket:
+def top_mass(ends: EigenEnds, density: SpectralDensity) -> Bracket:
     """lambda_max / sum |lambda|, at most 1: the share of all curvature that lies in the steepest direction."""
     top, total, known = _intervals(ends)[0], absolute_sum(density, JOINT), _farthest(ends)
     if not total.value:
@@ -108,7 +105,7 @@ def share(ends: EigenEnds, density: SpectralDensity) -> Bracket:
     return Bracket(value, low, min(high, 1.0), total.note)
 
 
-def effective_rank(ends: EigenEnds, density: SpectralDensity) -> Bracket:
+def participation_ratio(ends: EigenEnds, density: SpectralDensity) -> Bracket:
     """(sum |lambda|)^2 / sum lambda^2, between 1 and n: over how many directions curvature is spread."""
     total, known = absolute_sum(density, JOINT), _farthest(ends)
     if not total.value:

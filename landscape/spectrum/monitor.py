@@ -25,7 +25,7 @@ from landscape.operators.renderer.renderer import RendererHessian
 from landscape.traces.pixels import gauss_newton_traces
 
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
-INDICES = ("literal", "saddle", "share", "effective_rank")
+INDICES = ("eigenvalue_ratio", "negative_ratio", "top_mass", "participation_ratio")
 COLUMNS = (
     "step", "gaussians", "state", "note", "seconds", "time_share", "visible_gaussians", "parameters", "matvecs",
     *(f"trace_{name}{key}" for name in ATTRIBUTES for key in ("", "_error", "_low", "_high", "_dim", "_reason")),

@@ -29,7 +29,7 @@ from landscape.errors import InputError
 from landscape.linalg import group_sums
 from landscape.operators.operator import SymmetricOperator, product, products
 from landscape.probes import draw_probes
-from landscape.results import Brief, Progress
+from landscape.results import Progress, ShortRepr
 from landscape.traces.choice import WORSE, outside_sketch
 from landscape.traces.hutchinson import joined
 from landscape.traces.sketches.sketched import added_directions
@@ -41,7 +41,7 @@ SQUARED = 1e-140, 1e140  # numbers whose squares, and sums of them, are floats w
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GroupSums(Brief):
+class GroupSums(ShortRepr):
     """sum |H_rr| over the rows of each group, with its standard error.
 
     bias: the mean excess of `values` that noise causes (see the top of this module); it is not subtracted.
@@ -53,7 +53,7 @@ class GroupSums(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DiagonalEstimate(Brief):
+class DiagonalEstimate(ShortRepr):
     """diag H.  samples: one column for each test vector, with the mean `values`.
 
     matvecs: products used.  method: "signs", "sketch" or "pixels" (`pixels`, where products are samples).

@@ -54,7 +54,7 @@ def truth_of_matrix(matrix: Float64[Tensor, "n n"], blocks: Mapping[str, slice])
         largest=float(values[-1]),
         smallest=float(values[0]),
         absolute_sum=total,
-        effective_rank=total**2 / float(values.square().sum()),
+        participation_ratio=total**2 / float(values.square().sum()),
         diagonal=diagonal.clone(),
     )
 

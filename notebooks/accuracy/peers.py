@@ -245,7 +245,7 @@ def _eigenthings(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Metho
         total, squares = float((weights * values.abs()).sum()), float((weights * values.square()).sum())
         return [
             Answer("sum of |lambda|", operator.dim * total),
-            Answer("effective rank", operator.dim * total**2 / squares),
+            Answer("participation ratio", operator.dim * total**2 / squares),
         ]
 
     for budget, (method, name) in product(budgets, {"hutchinson": "Hutchinson", "hutch++": "Hutch++"}.items()):

@@ -16,7 +16,7 @@ MATRICES = 1.1  # the same on matrices, for every quantity
 DRAWS = 200  # of the bootstrap
 LIMITS = (0.025, 0.975)  # of a 95% interval
 MEANS = ("error", "needs", "rival_needs", "ratio", "seconds_ratio")  # columns averaged over scenes
-QUANTITIES = ("traces", "ends", "sum of |lambda|", "effective rank", "diagonal")
+QUANTITIES = ("traces", "ends", "sum of |lambda|", "participation ratio", "diagonal")
 
 
 @dataclass(frozen=True, eq=False)

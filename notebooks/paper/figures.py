@@ -75,7 +75,7 @@ def captions(rows: pd.DataFrame, drawn: Sequence[str]) -> str:
         "predictors": _of_predictors(predictors(rows)),
         "budget": _of_budget(rows),
         "axes": _of_axes(rows),
-        "index": "The literal index |λmax / λmin| over the steps; line: median, band: all seeds.",
+        "index": "The eigenvalue ratio |λmax / λmin| over the steps; line: median, band: all seeds.",
     }
     lines = [f"**{name}.** {caption}" for name, caption in words.items() if name in drawn] + [_trainings(rows)]
     lines += [f"{each.number}. {each.statement} **{each.verdict}.** {each.finding}" for each in judgements(rows)]
@@ -203,7 +203,7 @@ def draw_axes(rows: pd.DataFrame) -> Figure:
 
 def draw_index(along: pd.DataFrame) -> Figure:
     """The median of each method's seeds, and the band from the least to the largest."""
-    known = pd.DataFrame(along[along["literal"].notna()])
+    known = pd.DataFrame(along[along["eigenvalue_ratio"].notna()])
     methods = known["run"].astype(str).str.split("/").str[0]
     with style():
         figure = new_figure(2.6)
@@ -212,7 +212,7 @@ def draw_index(along: pd.DataFrame) -> Figure:
         for method, colour in zip(dict.fromkeys(methods), RUNS):
             part = pd.DataFrame(known[methods == method])
             steps = sorted(set(part["step"]))
-            values = [np.abs(part.loc[part["step"] == step, "literal"].to_numpy(float)) for step in steps]
+            values = [np.abs(part.loc[part["step"] == step, "eigenvalue_ratio"].to_numpy(float)) for step in steps]
             low, middle, high = ([float(of(each)) for each in values] for of in (np.min, np.median, np.max))
             axes.fill_between(steps, low, high, color=colour, alpha=0.25, linewidth=0)
             axes.plot(steps, middle, "-o", color=colour, markersize=2, label=literal(method))

@@ -49,13 +49,13 @@ class Judgement:
 def anisotropy(rows: pd.DataFrame) -> Judgement:
     effects = []
     for name in INDICES:
-        sign = -1 if name == "effective_rank" else 1  # a larger rank is less anisotropic
+        sign = -1 if name in ("negative_ratio", "participation_ratio") else 1  # the larger, the less anisotropic
         effects.append(ratio_effect(name.replace("_", " "), sign * log_ratios(rows, name), 0.26))
     against = [each.name for each in effects if decide(each) == "does not hold" or each.interval.low > 1]
     verdict = decide(effects[0])
     if verdict == "holds" and against:
         verdict = "holds in part"
-    finding = f"StableGS multiplies the literal index by {effects[0].interval.text()}; 74% less would be 0.26."
+    finding = f"StableGS multiplies the eigenvalue ratio by {effects[0].interval.text()}; 74% less would be 0.26."
     if against:
         finding += f" Not lowered, or by far less: {', '.join(against)}."
     return Judgement(
@@ -139,7 +139,7 @@ def samples(rows: pd.DataFrame) -> Judgement:
         verdict = "holds"
     if any(effect.interval.n >= LEAST and effect.interval.low > SUFFICIENT for effect in least):
         verdict = "does not hold"
-    finding = "No run has the anisotropy of its attributes; probe with --families."
+    finding = "No run has the anisotropy of its attributes; probe with --per-attribute."
     if least:
         bounds = [max(part, key=lambda effect: effect.interval.value) for part in (least, most) if part]
         finding = "With ten Gaussian samples the relative standard error of the trace is at least " + ", at most ".join(

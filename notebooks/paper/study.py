@@ -168,7 +168,7 @@ def _more(data: ProbeRecord, rates: LearningRates, extent: float) -> dict[str, f
         row |= {"needles": lives.needles, "needle_count": lives.needle_count / max(data.counts.visible_gaussians, 1)}
         row |= {"one_gaussian": lives.heaviest[0][1] if lives.heaviest else nan}
         row |= _finite(data, lives.attributes, rates, extent)
-    for family in data.families or ():
+    for family in data.per_attribute or ():
         if (family.operator, family.block, family.split) == ("hessian", "all", False) and family.metric != "parameters":
             indices = {name: index for name, index in structs.asdict(family.indices).items() if index}
             row |= {f"{name}_{family.metric}": _number(index.value) for name, index in indices.items()}
@@ -192,8 +192,8 @@ def _hutchinson(data: ProbeRecord) -> dict[str, float]:
     Its square is 2 |H|_F^2 / (B tr^2) = (2 / (B r)) (S / tr)^2 with S = sum |lambda| >= |tr| and r = S^2 / sum lambda^2.
     """
     found = {}
-    for row in data.families or ():
-        rank, share, trace = row.indices.effective_rank, row.indices.share, data.traces.get(row.block)
+    for row in data.per_attribute or ():
+        rank, share, trace = row.indices.participation_ratio, row.indices.top_mass, data.traces.get(row.block)
         if row.operator != "hessian" or row.split or row.metric != "parameters" or not (rank and share and trace):
             continue
         if rank.high:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.results import Brief
+from landscape.results import ShortRepr
 from splat.model.gaussians import Gaussians
 
 GEOMETRY_COLUMNS = {
@@ -19,7 +19,7 @@ GEOMETRY_COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PerGaussianBlocks(Brief):
+class PerGaussianBlocks(ShortRepr):
     """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH.
 
     views: of blocks that are a mean over views, `traces` of each view's blocks, or nothing.

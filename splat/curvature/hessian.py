@@ -24,16 +24,21 @@ MOST_RECORDED = 1 << 28
 class ViewSum:
     """The sum of the Hessians, or Gauss-Newton parts, of this process's views: an operator of `landscape` on their device.
 
-    count: number of views, from the first; all by default.  coupled: False for the pixel-diagonal of the losses' l'' in place
-    of l'', without the coupling of pixels by SSIM.
+    count: number of views, from the first; all by default.  ssim_window: False for the pixel-diagonal of the
+    losses' l'' in place of l''.
     spared: number of products of a view with a vector that were skipped so far, because the vector moves no Gaussian that the
     view draws (on a CPU).
     """
 
     def __init__(
-        self, objective: SceneObjective, *, gauss_newton: bool = False, count: int | None = None, coupled: bool = True
+        self,
+        objective: SceneObjective,
+        *,
+        gauss_newton: bool = False,
+        count: int | None = None,
+        ssim_window: bool = True,
     ):
-        self.objective, self.gauss_newton, self.count, self.coupled = objective, gauss_newton, count, coupled
+        self.objective, self.gauss_newton, self.count, self.ssim_window = objective, gauss_newton, count, ssim_window
         self.dim, self.dtype, self.blocks = objective.active.flat.numel(), objective.active.flat.dtype, objective.blocks
         self.spared = 0
 
@@ -45,7 +50,7 @@ class ViewSum:
             product = view.ggn if self.gauss_newton else view.hvp
             for part, total in zip(parts, totals, strict=True):
                 if view.affects(part):
-                    product(part, total, coupled=self.coupled)
+                    product(part, total, ssim_window=self.ssim_window)
                 else:
                     self.spared += part.shape[1]
         return torch.cat(totals, dim=1) if len(totals) > 1 else totals[0]
@@ -55,7 +60,7 @@ class ViewSum:
         found = torch.zeros(len(self.objective.views), V.shape[1], dtype=torch.float64)
         for row, view in zip(found, islice(self.objective.linearized, self.count), strict=False):
             product = view.ggn if self.gauss_newton else view.hvp
-            row += (V.double() * product(V, coupled=self.coupled)).sum(dim=0).cpu()
+            row += (V.double() * product(V, ssim_window=self.ssim_window)).sum(dim=0).cpu()
         return found
 
 
@@ -67,7 +72,7 @@ class SceneHessian:
 
     For the Hessian, P removes the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and
     the SH directions that no view sees; for Gauss-Newton, all directions that no view sees.  keep_null: P = 1 instead.
-    count: only the part of H due to so many views of each process, from the first.  coupled: see `ViewSum`.
+    count: only the part of H due to so many views of each process, from the first.  ssim_window: see `ViewSum`.
 
     views: H without P, summed over this process's views.  projector: P.
 
@@ -86,10 +91,10 @@ class SceneHessian:
         gauss_newton: bool = False,
         keep_null: bool = False,
         count: int | None = None,
-        coupled: bool = True,
+        ssim_window: bool = True,
     ):
         self.objective, self.gauss_newton, self.keep_null = objective, gauss_newton, keep_null
-        self.views = ViewSum(objective, gauss_newton=gauss_newton, count=count, coupled=coupled)
+        self.views = ViewSum(objective, gauss_newton=gauss_newton, count=count, ssim_window=ssim_window)
         self.dim, self.dtype, self.blocks = self.views.dim, self.views.dtype, self.views.blocks
 
     @cached_property

@@ -144,16 +144,16 @@ class LinearizedView:
         return self._pullback([self._raster.backward(self._raster.pad(g)) for g in G])
 
     def hvp(
-        self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, coupled: bool = True
+        self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, ssim_window: bool = True
     ) -> Float[Tensor, "p k"]:
-        """H U; added to total in place, where that is given.  coupled: False for the pixel-diagonal of l'' in place of l''."""
-        return self._regularizers.add_product(self._projection.vjp(self._adjoint_tangent(U, coupled), U, total), U)
+        """H U; added to total in place, where that is given.  ssim_window: False for l'' without its off-diagonal."""
+        return self._regularizers.add_product(self._projection.vjp(self._adjoint_tangent(U, ssim_window), U, total), U)
 
     def ggn(
-        self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, coupled: bool = True
+        self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, ssim_window: bool = True
     ) -> Float[Tensor, "p k"]:
-        """G U, the Gauss-Newton part of H U; total, coupled: see `hvp`."""
-        cotangents = self._loss_product(self._tangent(U), coupled)
+        """G U, the Gauss-Newton part of H U; total, ssim_window: see `hvp`."""
+        cotangents = self._loss_product(self._tangent(U), ssim_window)
         return self._pullback([self._raster.backward(cotangent) for cotangent in cotangents], total)
 
     def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
@@ -192,15 +192,15 @@ class LinearizedView:
         require_vectors(U, flat.numel(), flat.dtype, flat.device)
         return self._raster.jvp(self._projection.jvp(U))
 
-    def _adjoint_tangent(self, U: Float[Tensor, "p k"], coupled: bool) -> Float[Tensor, "n k 9"]:
+    def _adjoint_tangent(self, U: Float[Tensor, "p k"], ssim_window: bool) -> Float[Tensor, "n k 9"]:
         """The tangent of the splats' adjoint; a method, so that its planes are freed before `hvp` allocates the result."""
         tangent = self._tangent(U)
-        return tangent.backward_tangent(self._adjoint, self._loss_product(tangent, coupled))
+        return tangent.backward_tangent(self._adjoint, self._loss_product(tangent, ssim_window))
 
-    def _loss_product(self, tangent: Tangent, coupled: bool) -> Float[Tensor, "k 4 H W"]:
+    def _loss_product(self, tangent: Tangent, ssim_window: bool) -> Float[Tensor, "k 4 H W"]:
         """l'' times the tangents of the image, which are overwritten."""
         planes = tangent.planes
-        if coupled:
+        if ssim_window:
             return self._loss.hvp(planes, out=planes)
         planes[:, :3] *= self._loss.diagonal
         planes[:, 3] = 0

@@ -300,7 +300,7 @@ class SceneObjective:
     ) -> PerGaussianBlocks:
         """The block of every Gaussian in the Hessian of L, or in its Gauss-Newton part: exact, on the CPU.
 
-        approximate: with the diagonal of the loss's l'' in place of l'', without the coupling of pixels by SSIM.
+        approximate: with the diagonal of the loss's l'' in place of l'', without SSIM's window.
         traced: with the traces of every view, `PerGaussianBlocks.views`.
         """
         return self.block_diagonals(approximate=approximate, parts=(gauss_newton,), traced=traced)[0]

@@ -13,13 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.results import Brief
+from landscape.results import ShortRepr
 
 ROUND_OFF = 1e-4  # of a rotation in a file, |R R^T - 1|
 
 
 @dataclass(frozen=True, repr=False)
-class Camera(Brief):
+class Camera(ShortRepr):
     """rotation: world to camera, float64; centre: camera centre in world units, float64; the rest in pixels.
 
     InputError where the rotation is none, or a number is not finite or, but for centre and principal point, not positive.

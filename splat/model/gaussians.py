@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.results import Brief
+from landscape.results import ShortRepr
 
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
@@ -43,7 +43,7 @@ def parameters_per_gaussian(sh_degree: int) -> int:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Gaussians(Brief):
+class Gaussians(ShortRepr):
     """n Gaussians over one flat vector of n (11 + 3 (sh_degree + 1)^2) stored parameters.
 
     filter_widths: of each one's 3-D filter, world units, in the type of the vector and where that is; None: there is no filter.

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.results import Brief
+from landscape.results import ShortRepr
 from splat.backend.memory import free_memory
 from splat.model.camera import Camera
 from splat.scenes.formats.colmap import MODEL_FOLDERS, find_model, part_of_model, read_colmap
@@ -31,14 +31,14 @@ from splat.scenes.formats.llff import POSES, read_llff
 from splat.scenes.formats.transforms import BLENDER_FILES, SINGLE_FILE, read_blender, read_transforms
 from splat.scenes.images import Photo, frame, image_header, require_files
 from splat.scenes.layers import DEPTH_SUFFIXES, MASK_FOLDERS, MASK_SUFFIXES, find_layer
-from splat.scenes.view import Frame, Photograph, Points, Shelf, View
+from splat.scenes.view import Frame, Photograph, Points, View, ViewCache
 
 PICTURES = 0.25  # of the free memory
 Kind = Literal["colmap", "llff", "blender", "transforms", "dtu", "synthetic"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Scene(Brief):
+class Scene(ShortRepr):
     """Frames sorted by name (Blender: in the order of its files), points if any, and the background colour.
 
     notes: sentences on what its files say and is not used.
@@ -74,7 +74,7 @@ class Scene(Brief):
         """
         frames = self.frames if names is None else self.select(names)
         room = int(PICTURES * free_memory(torch.device("cpu")))
-        shelf = Shelf(room) if sum(frame.bytes for frame in frames) > room else None
+        shelf = ViewCache(room) if sum(frame.bytes for frame in frames) > room else None
         with ThreadPoolExecutor(max(1, min(len(frames), torch.get_num_threads()))) as readers:
             if shelf is None:
                 return list(readers.map(lambda frame: frame.view(), frames))

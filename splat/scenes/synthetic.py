@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.results import Brief
+from landscape.results import ShortRepr
 from splat.model.camera import Camera, look_at
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
@@ -58,7 +58,7 @@ class SyntheticSettings:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SyntheticScene(Brief):
+class SyntheticScene(ShortRepr):
     """The scene as a loader would give it, and the Gaussians that it was rendered from."""
 
     scene: Scene

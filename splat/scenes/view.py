@@ -2,7 +2,7 @@
 
     View    a camera with its picture, as training and evaluation use it
     Frame   a camera whose picture is read from disk by `view()`, and larger by `whole_view()`; the camera is already final
-    Shelf   as many views of frames as there is room for, the others as `Photograph`s: views that are read when they are used
+    ViewCache   as many views of frames as there is room for, the others as `Photograph`s, read when they are used
     Points  coloured points of the scene, from structure from motion or a scanner, and the images that see each of them
 
 Pictures are (3, h, w) float32 in [0, 1], in the encoding of the file (no linearisation), composited over the scene's
@@ -21,14 +21,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.results import Brief
+from landscape.results import ShortRepr
 from splat.model.camera import Camera
 
 Subset = Literal["train", "test"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class View(Brief):
+class View(ShortRepr):
     """A camera and its picture.  InputError where their sizes differ.
 
     alpha: coverage in [0, 1] where the file has an alpha channel.  mask: the pixels that metrics count, where the scene
@@ -96,7 +96,7 @@ class Frame:
         return (3 + len(self.layers)) * self.camera.width * self.camera.height * torch.float32.itemsize
 
 
-class Shelf:
+class ViewCache:
     """Views of frames; the last used stay in memory, as many as fit into so many bytes, at least one."""
 
     def __init__(self, memory: int):
@@ -118,7 +118,7 @@ class Shelf:
 class Photograph(View):
     """A view of a shelf: its picture and what belongs to it are read when they are used, and may be read again."""
 
-    def __init__(self, frame: Frame, shelf: Shelf):
+    def __init__(self, frame: Frame, shelf: ViewCache):
         for name, value in {"name": frame.name, "camera": frame.camera, "_frame": frame, "_shelf": shelf}.items():
             object.__setattr__(self, name, value)
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError, did_you_mean, lacks_memory
-from landscape.results import Brief
+from landscape.results import ShortRepr
 from splat.losses.reference import LossSettings
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
@@ -43,7 +43,7 @@ REMEDY = "take another copy of the file, or train anew"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Checkpoint(Brief):
+class Checkpoint(ShortRepr):
     """A saved training and its scene.
 
     origin: what was assumed of another tool's file (`foreign_training`).  all_views: number of views that it was trained on,

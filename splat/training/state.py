@@ -20,7 +20,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
-from landscape.results import Brief
+from landscape.results import ShortRepr
 from splat.backend.memory import free_memory
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import Clamped
@@ -257,7 +257,7 @@ class TrainConfig(Settings):
 
 
 @dataclass(eq=False, repr=False)
-class Training(Brief):
+class Training(ShortRepr):
     """State of a training: all that its next step depends on.
 
     extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.

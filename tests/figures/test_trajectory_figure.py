@@ -21,7 +21,7 @@ from tests.recorded import ATTRIBUTES
 
 
 def rows(scale: float = 1.0, steps: int = 4) -> pd.DataFrame:
-    """A run's records, the first one skipped; the literal index is negative, the effective rank unbounded above."""
+    """A run's records, the first one skipped; the eigenvalue ratio is negative, the participation ratio unbounded above."""
     found = []
     for i in range(1, steps + 1):
         row = {"step": 500 * i, "gaussians": 1000 * i, "state": "whole", "note": "", "seconds": 1.0, "time_share": 0.1}
@@ -35,8 +35,16 @@ def rows(scale: float = 1.0, steps: int = 4) -> pd.DataFrame:
             "lambda_min": -scale / i,
             "lambda_min_error": 0.0,
         }
-        row |= {"literal": -float(i * i), "literal_low": -1.1 * i * i, "literal_high": -0.9 * i * i}
-        row |= {"effective_rank": 10.0 * i, "effective_rank_low": 5.0 * i, "effective_rank_high": math.nan}
+        row |= {
+            "eigenvalue_ratio": -float(i * i),
+            "eigenvalue_ratio_low": -1.1 * i * i,
+            "eigenvalue_ratio_high": -0.9 * i * i,
+        }
+        row |= {
+            "participation_ratio": 10.0 * i,
+            "participation_ratio_low": 5.0 * i,
+            "participation_ratio_high": math.nan,
+        }
         found.append(row)
     found[0] = {key: value for key, value in found[0].items() if key in COLUMNS[:6]} | {"state": "skipped"}
     return pd.DataFrame(found, columns=list(COLUMNS))
@@ -62,21 +70,25 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
         (line,) = [x for x in panels["trace of position"].lines if to_hex(x.get_color()).upper() == colour]
         assert list(np.asarray(line.get_xdata())) == [1000, 1500, 2000], name  # the skipped record is left out
         assert np.asarray(line.get_ydata()) == pytest.approx([scale * (i - 2.5) for i in (2, 3, 4)])
-    literal = panels["|λmax / λmin|"]
-    hollow = [x for x in literal.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) == "#ffffff"]
+    eigenvalue_ratio = panels["|λmax / λmin|"]
+    hollow = [
+        x for x in eigenvalue_ratio.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) == "#ffffff"
+    ]
     assert [float(y) for x in hollow for y in np.asarray(x.get_ydata())] == [4.0, 9.0, 16.0] * 2
-    assert literal.get_yscale() == "log" and panels["trace of log scale"].get_yscale() == "log"
-    bounds = [x for x in panels["effective rank"].lines if x.get_marker() == "^" and len(np.asarray(x.get_xdata()))]
+    assert eigenvalue_ratio.get_yscale() == "log" and panels["trace of log scale"].get_yscale() == "log"
+    bounds = [
+        x for x in panels["participation ratio"].lines if x.get_marker() == "^" and len(np.asarray(x.get_xdata()))
+    ]
     assert [float(y) for x in bounds for y in np.asarray(x.get_ydata())] == [10.0, 15.0, 20.0] * 2
     gaussians = panels["Gaussians"].lines[0]
     assert list(np.asarray(gaussians.get_ydata())) == [1000, 2000, 3000, 4000]
 
 
 def test_an_index_that_coarse_records_lack_is_said_to_be_so():
-    coarse = rows().assign(run="a", effective_rank=math.nan, effective_rank_low=math.nan)
+    coarse = rows().assign(run="a", participation_ratio=math.nan, participation_ratio_low=math.nan)
     panels = {axes.get_title(): axes for axes in trajectory.draw(coarse).axes}
-    assert [text.get_text() for text in panels["effective rank"].texts] == ["not measured"]
-    assert not panels["effective rank"].get_xticks().size and not panels["|λmax / λmin|"].texts
+    assert [text.get_text() for text in panels["participation ratio"].texts] == ["not measured"]
+    assert not panels["participation ratio"].get_xticks().size and not panels["|λmax / λmin|"].texts
 
 
 def test_ticks_are_at_steps_such_as_are_recorded():
@@ -91,7 +103,7 @@ def test_every_point_stands_at_its_step_and_the_band_is_its_bracket():
     assert list(np.asarray(line.get_xdata())) == list(measured["step"])
     assert np.array_equal(line.get_transform().transform((1000, 4.0)), axes.transData.transform((1000, 4.0)))
     corners = np.asarray(axes.collections[0].get_paths()[0].vertices)
-    ends = np.abs(np.asarray(measured[["literal_low", "literal_high"]], float))
+    ends = np.abs(np.asarray(measured[["eigenvalue_ratio_low", "eigenvalue_ratio_high"]], float))
     assert corners[:, 1].min() == pytest.approx(ends.min()) and corners[:, 1].max() == pytest.approx(ends.max())
 
 
@@ -106,14 +118,14 @@ def test_powers_of_ten_have_a_line_and_the_legend_says_what_is_open():
         UNITS,
     ]
     positive = rows().assign(run="a")
-    positive["literal"] = positive["literal"].abs()
-    positive["effective_rank_high"] = 2 * positive["effective_rank"]
+    positive["eigenvalue_ratio"] = positive["eigenvalue_ratio"].abs()
+    positive["participation_ratio_high"] = 2 * positive["participation_ratio"]
     assert [text.get_text() for text in trajectory.draw(positive).legends[0].get_texts()] == ["a", UNITS]
 
 
 def test_of_an_index_without_any_bound_nothing_is_drawn(tmp_path):
     table = rows().assign(run="a")
-    table.loc[2, ["literal_low", "literal_high"]] = 0.0, math.nan
+    table.loc[2, ["eigenvalue_ratio_low", "eigenvalue_ratio_high"]] = 0.0, math.nan
     panels = {axes.get_title(): axes for axes in trajectory.draw(table).axes}
     drawn = [float(y) for x in panels["|λmax / λmin|"].lines for y in np.asarray(x.get_ydata())]
     assert 9.0 not in drawn and {4.0, 16.0} <= set(drawn)
@@ -130,8 +142,15 @@ def test_the_command_prints_first_and_last_values_and_writes_the_files(tmp_path,
     lines = [line.split() for line in said.splitlines()]
     assert ["3dgs/0", "(1", "skipped)", "step", "1,000", "(whole)", "step", "2,000", "(whole)"] in lines
     assert ["largest", "eigenvalue", "2.00", "±", "0.10", "4.00", "±", "0.10"] in lines
-    assert lines[lines.index(["literal", "−4.00", "−16.0"]) + 1] == ["−4.40", "to", "−3.60", "−17.6", "to", "−14.4"]
-    assert ["effective", "rank", "≥", "10.0", "≥", "20.0"] in lines  # of which nothing else is certain
+    assert lines[lines.index(["eigenvalue", "ratio", "−4.00", "−16.0"]) + 1] == [
+        "−4.40",
+        "to",
+        "−3.60",
+        "−17.6",
+        "to",
+        "−14.4",
+    ]
+    assert ["participation", "ratio", "≥", "10.0", "≥", "20.0"] in lines  # of which nothing else is certain
 
 
 @pytest.mark.parametrize(

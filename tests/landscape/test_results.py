@@ -11,7 +11,7 @@ import splat
 from landscape.eigen.eigen import extreme_eigenpairs
 from landscape.eigen.power import power_ends
 from landscape.operators.checks import check_operator
-from landscape.results import Bracket, Brief, standard_deviation
+from landscape.results import Bracket, ShortRepr, standard_deviation
 from landscape.slices.refinement import SliceSettings
 from landscape.slices.slices import evaluate_slice
 from landscape.spectrum.anisotropy import anisotropy
@@ -71,7 +71,7 @@ def test_results_are_shown_in_three_lines():
 
 
 @dataclass(frozen=True, repr=False)
-class Much(Brief):
+class Much(ShortRepr):
     tensor: Tensor
     names: tuple[str, ...]
     inside: object
@@ -85,7 +85,7 @@ def test_a_result_fits_on_three_lines_however_much_it_holds():
     )
     assert repr(much) == "Much(tensor=float32 1000 x 7, names=tuple of 100, inside=Much, bracket=2 in [1, 3])"
     assert "names=('a',), inside=None" in repr(much.inside)
-    wide = make_dataclass("Wide", [(f"field_number_{i}", int) for i in range(99)], bases=(Brief,), repr=False)
+    wide = make_dataclass("Wide", [(f"field_number_{i}", int) for i in range(99)], bases=(ShortRepr,), repr=False)
     said = repr(wide(*range(99)))
     assert said.count("\n") == 2 and said.endswith(" ...") and max(map(len, said.splitlines())) <= 100
 

@@ -79,7 +79,7 @@ def test_the_truth_of_a_diagonal_matrix_is_what_its_entries_say():
     truth = truth_of_matrix(torch.diag(values), {"a": slice(0, 2), "b": slice(2, 4)})
     assert truth.traces == {"a": 3.0, "b": 5.0} and truth.scales == {"a": 5.0, "b": 5.0}
     assert (truth.largest, truth.smallest, truth.absolute_sum) == (4.0, -1.0, 10.0)
-    assert truth.effective_rank == pytest.approx(100 / 30)
+    assert truth.participation_ratio == pytest.approx(100 / 30)
     assert truth.diagonal is not None and torch.equal(truth.diagonal, values)
 
 
@@ -177,8 +177,8 @@ def test_true_errors_are_shares_of_their_scale(matrix):
     assert run.true_error == pytest.approx(0.5) and run.reported_error == pytest.approx(0.1) and run.covered == 0
     (run,) = answered("ends", Answer("smallest", 1.1 * truth.smallest))
     assert run.true_error == pytest.approx(0.1) and math.isnan(run.covered) and math.isnan(run.reported_error)
-    (run,) = answered("sums", Answer("effective rank", 2 * truth.effective_rank, low=1.0, high=1e9))
-    assert (run.quantity, run.covered) == ("effective rank", 1.0) and run.true_error == pytest.approx(1)
+    (run,) = answered("sums", Answer("participation ratio", 2 * truth.participation_ratio, low=1.0, high=1e9))
+    assert (run.quantity, run.covered) == ("participation ratio", 1.0) and run.true_error == pytest.approx(1)
     assert truth.diagonal is not None
     half = truth.diagonal.clone()
     half[:30] += 1

@@ -48,7 +48,7 @@ def test_the_budget_shows_each_seed_and_the_mean_of_each_method():
 def test_the_index_over_the_steps_has_the_band_of_all_seeds():
     steps = [0, 100, 200]
     along = pd.DataFrame(
-        {"run": f"{method}/{seed}", "step": step, "literal": -(2.0 + seed) * (step + 1)}
+        {"run": f"{method}/{seed}", "step": step, "eigenvalue_ratio": -(2.0 + seed) * (step + 1)}
         for method in ("3dgs", "stablegs")
         for seed in (0, 1)
         for step in steps

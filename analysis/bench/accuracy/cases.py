@@ -28,7 +28,7 @@ from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds
 from landscape.operators.operator import SymmetricOperator, require_vectors
 from landscape.spectrum.absolute_sum import absolute_sum
-from landscape.spectrum.anisotropy import effective_rank
+from landscape.spectrum.anisotropy import participation_ratio
 from landscape.spectrum.density import ActiveSpace, spectral_density
 from landscape.traces.trace import TraceSettings, total_trace
 from splat.curvature.hessian import SceneHessian
@@ -50,7 +50,7 @@ class Truth:
     largest: float
     smallest: float
     absolute_sum: float
-    effective_rank: float
+    participation_ratio: float
     diagonal: Float64[Tensor, " n"] | None
 
 
@@ -146,7 +146,7 @@ def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:
     ends = extreme_eigenpairs(hessian, generator(1), EigenSettings(rtol=FINE, basis=128, max_matvecs=MOST))
     active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)
     density = spectral_density(hessian, generator(2), STARTS * STEPS, STARTS, active=active, ends=ends, trace=trace)
-    rank = effective_rank(ends, density).value
+    rank = participation_ratio(ends, density).value
     assert rank is not None
     return Truth(
         traces={name: trace.value for name, trace in traces.items()},
@@ -154,6 +154,6 @@ def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:
         largest=float(ends.largest.values[0]),
         smallest=float(ends.smallest.values[0]),
         absolute_sum=absolute_sum(density).value or 0.0,
-        effective_rank=rank,
+        participation_ratio=rank,
         diagonal=None,
     )

@@ -6,7 +6,7 @@
     OUT/truth.json            the truth, a long run (`cases`)
 
 A method is run on an operator that counts, with a seed, and returns an `Answer` for each part of its quantity: traces for each
-block, ends "largest" and "smallest", sum of |lambda| and effective rank from one spectral density ("sums").
+block, ends "largest" and "smallest", sum of |lambda| and participation ratio from one spectral density ("sums").
 
 Work other than products H v is counted in products: PASS for a pass over the pixels that computes the diagonal block of every
 Gaussian and the ends of their spectra; JACOBIAN for a product with the images' Jacobian.
@@ -40,7 +40,7 @@ from analysis.console.plain import say
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds
 from landscape.spectrum.absolute_sum import absolute_sum
-from landscape.spectrum.anisotropy import effective_rank
+from landscape.spectrum.anisotropy import participation_ratio
 from landscape.spectrum.density import spectral_density
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.hutchinson import Method as TraceMethod
@@ -174,7 +174,10 @@ def _density(text: str, origin: Origin, known: bool = False, **division: int) ->
     def run(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         before = {"ends": case.ends, "trace": (sum(case.truth.traces.values()), 0.0)} if known else {}
         density = spectral_density(operator, generator(seed + 1), active=case.active, **division, **before)
-        found = {"sum of |lambda|": absolute_sum(density), "effective rank": effective_rank(case.ends, density)}
+        found = {
+            "sum of |lambda|": absolute_sum(density),
+            "participation ratio": participation_ratio(case.ends, density),
+        }
         return [
             Answer(part, nan if x.value is None else x.value, (x.high - x.low) / 2, x.low, x.high)
             for part, x in found.items()

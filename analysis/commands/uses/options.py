@@ -16,9 +16,9 @@ class PruneOptions:
     checkpoint: CheckpointPath
     keep: float = 0.5
     """Share of the Gaussians to keep, above 0."""
-    score: str = "rise_l2"
+    score: str = "removal_error_l2"
     """By which they are chosen.
-    rise, rise_l2: by how much the loss, or the squared error, would rise without the Gaussian, to second order.
+    removal_error, removal_error_l2: the rise of the loss, or of the squared error, without the Gaussian, to second order.
     log_det_6, log_det_11, gn_diagonal: log-determinants of its Gauss-Newton block, PUP 3D-GS's and whole, and its diagonal.
     opacity, size_opacity: as they are."""
     refine: int = 0

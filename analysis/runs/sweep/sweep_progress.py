@@ -106,4 +106,4 @@ class SweepProgress:
         options = self.sweep.probe
         if options is None:
             return 0.0
-        return (options.seconds or A_PROBE) + options.family_seconds * options.split_control
+        return (options.seconds or A_PROBE) + options.per_attribute_seconds * options.split_control

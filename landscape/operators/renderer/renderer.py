@@ -36,7 +36,7 @@ from landscape.errors import InputError
 from landscape.linalg import column_lengths, gram
 from landscape.operators.operator import require_finite, require_vectors
 from landscape.operators.renderer.parameters import Parameters
-from landscape.results import Brief
+from landscape.results import ShortRepr
 
 TRIALS = 2  # renders that find a step
 FACTOR = 1e4  # by which one of them changes it at most
@@ -44,7 +44,7 @@ ROUNDING = 1 / 4  # mean error of a rounded number, in units of eps
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ProductErrors(Brief):
+class ProductErrors(ShortRepr):
     """Errors of the products with k vectors, as lengths.
 
     step: of the difference to the product at twice the step.  An error that grows with the step differs by as much as it is,

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.spectrum.block_anisotropy import WHOLE
 from landscape.spectrum.density import ActiveSpace
-from landscape.spectrum.families import WHOLE
 from splat.curvature.null.colour_space import ColourSpace, seen_colours
 from splat.curvature.null.null_space import seen_parameters
 from splat.curvature.null.row_space import RowSpace
@@ -90,7 +90,7 @@ def projector_of(objective: SceneObjective, *, gauss_newton: bool = False, singl
 def active_spaces(
     objective: SceneObjective, projector: Projector, scale: Float[Tensor, " p"] | None = None
 ) -> dict[str, ActiveSpace]:
-    """Complements of the exact null space, of the whole operator and of each attribute's block, for `landscape.families`.
+    """Complements of the exact null space, of the whole and of each attribute's block, for `landscape.block_anisotropies`.
 
     projector: of the whole operator (`SceneHessian.projector`).  scale: diagonal of D > 0, 1 by default.  The blocks of
     Gauss-Newton are given the spaces of the Hessian's blocks; they may be flat along more directions.

@@ -1,6 +1,7 @@
 """Scores of single Gaussians for pruning: the lowest go first.
 
-    rise, rise_l2   the rise of the loss, and of the mean squared error, when the Gaussian is removed, to second order
+    removal_error, removal_error_l2   the rise of the loss, and of the mean squared error, when the Gaussian is removed, to
+                    second order
     log_det_6       ln det of the 6 x 6 of mean and log-scales in Gauss-Newton of the L2 loss: PUP 3D-GS (Hanson et al. 2025)
     log_det_11      the same of the 11 x 11 of its geometry and opacity, without the quaternion's length
     gn_diagonal     sum of ln of the 11 x 11's diagonal: log_det_11 of a method that keeps the diagonal alone
@@ -12,7 +13,7 @@ derivative of the image: it is Gauss-Newton's, and with the stored logit z, d om
 
     rise = -omega L_omega + omega^2 / 2 H_omega,omega = -g_z / (1 - omega) + G_zz / (2 (1 - omega)^2)
 
-where G_zz has SSIM's coupling of pixels.  For the L2 loss that is the change itself, but where alpha is cut, capped, or a pixel
+where G_zz has SSIM's window.  For the L2 loss that is the change itself, but where alpha is cut, capped, or a pixel
 stops; under L1 residuals that change sign are not seen.  It is taken at logits of OPAQUE at most, which draw the same pictures
 to 1.2e-4: beyond, 1 - omega is soon rounded to 0, and both quotients to 0 / 0.  Eigenvalues below d eps times the block's
 largest, which few views determine, count as that much.
@@ -29,7 +30,7 @@ from landscape.results import Progress
 from splat.curvature.fields import eigenvalues, on_complement
 from splat.curvature.objective import SceneObjective
 
-EXACT = ("rise", "rise_l2", "log_det_6", "log_det_11", "gn_diagonal")
+EXACT = ("removal_error", "removal_error_l2", "log_det_6", "log_det_11", "gn_diagonal")
 SCORES = (*EXACT, "opacity", "size_opacity")
 OPAQUE = 9.0  # a logit at which 1 - omega is 1.2e-4, and known to 2.4e-4 of itself in single precision
 GONE = -50.0  # a logit with which a Gaussian is drawn nowhere
@@ -42,7 +43,7 @@ def removal_scores(objective: SceneObjective, l2: SceneObjective) -> dict[str, F
     >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
     >>> views, l2 = made.scene.load(), LossSettings("l2", ssim_weight=0)
     >>> scores = removal_scores(SceneObjective(made.truth, views), SceneObjective(made.truth, views, l2))
-    >>> tuple(scores) == SCORES, bool((scores["rise_l2"] >= 0).all())  # the pictures are renders of these Gaussians
+    >>> tuple(scores) == SCORES, bool((scores["removal_error_l2"] >= 0).all())  # the pictures are renders of these Gaussians
     (True, True)
     """
     active = l2.active
@@ -54,8 +55,8 @@ def removal_scores(objective: SceneObjective, l2: SceneObjective) -> dict[str, F
     )
     omega = active.opacity_logits.double().sigmoid()
     return {
-        "rise": predicted_rise(objective),
-        "rise_l2": predicted_rise(l2),
+        "removal_error": predicted_rise(objective),
+        "removal_error_l2": predicted_rise(l2),
         "log_det_6": floored_log_det(geometry[:, :6, :6], eps),
         "log_det_11": floored_log_det(complement, eps),
         "gn_diagonal": _log_sum(diagonal, eps),

@@ -10,7 +10,7 @@ With B the part of H (or of Gauss-Newton) that a method keeps, and R = H - B the
     attributes  of these the 3 x 3 of the mean and of the log-scales, the 4 x 4 of the quaternion, and the diagonal of the rest
     diagonal
 
-Without the coupling of pixels by SSIM, which published methods drop, l'' is its pixel-diagonal.  The lengths of the quaternions
+Without SSIM's window, which published methods drop, l'' is its pixel-diagonal.  The lengths of the quaternions
 are projected out of H and B, as in `SceneHessian`; the other flat directions are 0 in both.
 """
 
@@ -39,7 +39,7 @@ class BlockShare:
     """
 
     gauss_newton: bool
-    coupled: bool
+    ssim_window: bool
     blocks: float
     attributes: float
     diagonal: float
@@ -54,25 +54,25 @@ def block_shares(
     samples: int = 8,
     progress: Progress | None = None,
     *,
-    coupled: bool = True,
+    ssim_window: bool = True,
 ) -> list[BlockShare]:
-    """The shares of the Hessian and of Gauss-Newton, and of both without SSIM's coupling where the loss has SSIM.
+    """The shares of the Hessian and of Gauss-Newton, and of both without SSIM's window where the loss has SSIM.
 
-    coupled: False for the latter alone, which takes a fifth of the time; so it is on a GPU, which lacks the exact blocks of a
-    loss with SSIM.  All see the same z.
+    ssim_window: False for the latter alone, which takes a fifth of the time; so it is on a GPU, which lacks the exact
+    blocks of a loss with SSIM.  All see the same z.
 
     >>> from splat import SceneObjective, SyntheticSettings, synthetic_scene
     >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
     >>> objective = SceneObjective(made.truth, made.scene.load())
     >>> shares = block_shares(objective, torch.Generator().manual_seed(0))
-    >>> [(one.gauss_newton, one.coupled, one.blocks > one.diagonal) for one in shares]
+    >>> [(one.gauss_newton, one.ssim_window, one.blocks > one.diagonal) for one in shares]
     [(False, True, True), (True, True, True), (False, False, True), (True, False, True)]
     """
     if samples < 2:
         raise InputError(f"expected at least 2 samples of the blocks' share, got {samples}")
     active = objective.active
     Z = draw_probes(active.flat.numel(), samples, generator, active.flat.dtype, "rademacher").to(active.flat.device)
-    couplings = [True, False] if coupled and backend_of(active.flat).exact_blocks else [False]
+    couplings = [True, False] if ssim_window and backend_of(active.flat).exact_blocks else [False]
     if not objective.couples_pixels:
         couplings = [True]  # l'' is its diagonal
     found: list[BlockShare] = []
@@ -80,7 +80,7 @@ def block_shares(
         exact = couples and objective.couples_pixels
         both = objective.exact_blocks if exact else [objective.approximate_blocks[0], objective.pixelwise_blocks]
         for gauss_newton, blocks in zip((False, True), both, strict=True):
-            operator = ViewSum(objective, gauss_newton=gauss_newton, coupled=couples)
+            operator = ViewSum(objective, gauss_newton=gauss_newton, ssim_window=couples)
             found.append(_share(operator, blocks.across(active.quats), Z))
             if progress:
                 progress(len(found), 2 * len(couplings), "operators of which the blocks' share is taken")
@@ -102,7 +102,14 @@ def _share(operator: ViewSum, blocks: PerGaussianBlocks, Z: Float[Tensor, "p s"]
     )
     error = float(rest.std()) / sqrt(samples) / norm if norm else 0.0
     return BlockShare(
-        operator.gauss_newton, operator.coupled, blocks_share, attributes_share, diagonal_share, norm, error, samples
+        operator.gauss_newton,
+        operator.ssim_window,
+        blocks_share,
+        attributes_share,
+        diagonal_share,
+        norm,
+        error,
+        samples,
     )
 
 

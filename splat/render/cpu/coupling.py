@@ -1,4 +1,4 @@
-"""The part of every splat's diagonal block that SSIM's coupling of pixels adds, exactly.
+"""The part of every splat's diagonal block that SSIM's window adds, exactly.
 
 The second derivative of SSIM couples the pixels of a window g (a Gaussian, "blur").  In each channel, for a change d of the
 image, with S'' (3, 3) at the window's centre (`losses/formulas.py`), r the residual, y the target and c = 1/2,

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.results import Brief
+from landscape.results import ShortRepr
 from splat.losses.reference import psnr, ssim
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -36,7 +36,7 @@ class ViewScore:
 
 
 @dataclass(frozen=True, repr=False)
-class Evaluation(Brief):
+class Evaluation(ShortRepr):
     """Scores of every view, and their means, which papers report.  masked: whether only pixels inside masks count."""
 
     views: tuple[ViewScore, ...]

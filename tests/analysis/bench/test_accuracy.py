@@ -19,7 +19,7 @@ def test_estimators_are_compared_with_a_long_run_on_ones_own_scene(tmp_path, mon
     bench = ["bench", "accuracy", str(tmp_path / "run"), "--repetitions", "2", "--out", str(tmp_path / "out")]
     assert main(bench) == 0
     table = pd.read_csv(tmp_path / "out" / "accuracy.csv")
-    assert set(table["quantity"]) == {"traces", "ends", "sum of |lambda|", "effective rank"}
+    assert set(table["quantity"]) == {"traces", "ends", "sum of |lambda|", "participation ratio"}
     default = table[(table["quantity"] == "traces") & (table["origin"] == "default")].iloc[0]
     assert default["true_error"] < 0.05 and default["matvecs"] > 0
     fixed = table[table["method"] == "Hutchinson, Rademacher"].iloc[0]

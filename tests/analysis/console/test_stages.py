@@ -37,6 +37,6 @@ def test_a_stage_that_takes_longer_than_expected_is_not_always_at_its_end(name, 
 
 def test_nothing_is_said_of_what_nobody_planned():
     stages = planned()
-    assert stages.left("families", 3.0, 1) == ""
+    assert stages.left("per_attribute", 3.0, 1) == ""
     stages.timing |= dict.fromkeys(stages.plan, 1.0)
     assert stages.left() == "" == Stages().left()

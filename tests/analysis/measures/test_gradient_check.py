@@ -32,8 +32,8 @@ def twice(view: LinearizedView) -> Callable[..., torch.Tensor]:
     """Its products, wrong by a factor of 2."""
     right = view.hvp
 
-    def wrong(V: torch.Tensor, total: torch.Tensor | None = None, *, coupled: bool = True) -> torch.Tensor:
-        product = 2 * right(V, coupled=coupled)
+    def wrong(V: torch.Tensor, total: torch.Tensor | None = None, *, ssim_window: bool = True) -> torch.Tensor:
+        product = 2 * right(V, ssim_window=ssim_window)
         return product if total is None else total.add_(product)
 
     return wrong

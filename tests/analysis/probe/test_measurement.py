@@ -47,7 +47,7 @@ def test_kernels_are_compiled_before_the_time_is_told_and_blocks_made_once(monke
     counted(measurement, "check_against_gradient")
     counted(measurement, "plan_of")
     objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
-    settings = replace(ProbeSettings.quick(), slice_points=5, block_coupling=True)
+    settings = replace(ProbeSettings.quick(), slice_points=5, block_ssim_window=True)
     found = measure(objective, settings, LENGTHS, torch.Generator().manual_seed(0), Stages())
     first = calls[: calls.index("plan_of")]
     assert {"block_diagonal", "evaluate", "exact", "check_against_gradient"} <= {*first}
@@ -126,7 +126,7 @@ def test_a_quick_probe_is_expected_to_take_what_it_makes_alone():
     assert (
         quick["slice"].seconds == pytest.approx(1.5 * 21 * 10.0) and quick["traces"].seconds < whole["traces"].seconds
     )
-    assert plan_of(ProbeSettings(), 2.0, 10.0, {"families": (6, 100, 1)})["families"] == Work(210.0, 6)
+    assert plan_of(ProbeSettings(), 2.0, 10.0, {"per_attribute": (6, 100, 1)})["per_attribute"] == Work(210.0, 6)
 
 
 def test_traces_that_samples_do_not_resolve_are_exact():

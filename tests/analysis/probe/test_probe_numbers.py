@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 
 from analysis.measures.depth import STEPS, depth_split
-from analysis.probe.record import literal_index
+from analysis.probe.record import paper_index
 from analysis.records.findings import findings
 from analysis.records.quantities import measured
 from analysis.records.tables import probe_table
@@ -50,28 +50,28 @@ def test_eigenvalues_are_those_of_the_dense_hessian_within_their_residuals(recor
         assert abs(end.value - float(true[index])) <= end.residual + rounding(H), name
         assert end.residual <= 1e-3 * abs(end.value) and end.reason == "tolerance"
         assert sum(end.shares.values()) == pytest.approx(1) and list(end.shares) == ATTRIBUTES
-    saddle = record.data.anisotropy.saddle
+    saddle = record.data.anisotropy.negative_ratio
     assert saddle.low <= float(-true[-1] / true[0]) <= saddle.high
-    share = record.data.anisotropy.share
+    share = record.data.anisotropy.top_mass
     assert share.low <= float(true[-1] / true.abs().sum()) <= share.high
 
 
 def test_the_literal_index_is_by_power_iteration_where_that_arrived(record, dense):
     _, H, _, _ = dense
-    ends, literal = record.data.eigenvalues, record.data.anisotropy.literal
+    ends, eigenvalue_ratio = record.data.eigenvalues, record.data.anisotropy.eigenvalue_ratio
     true = torch.linalg.eigvalsh((H + H.T) / 2)
-    assert literal.low <= float(true[-1] / true[0]) <= literal.high
+    assert eigenvalue_ratio.low <= float(true[-1] / true[0]) <= eigenvalue_ratio.high
     paper = ends.power_max.value / ends.power_min.value
-    arrived = literal.low <= paper <= literal.high
-    assert literal.value == (paper if arrived else ends.max.value / ends.min.value)
-    assert ("did not arrive" in literal.note) == (not arrived)
+    arrived = eigenvalue_ratio.low <= paper <= eigenvalue_ratio.high
+    assert eigenvalue_ratio.value == (paper if arrived else ends.max.value / ends.min.value)
+    assert ("did not arrive" in eigenvalue_ratio.note) == (not arrived)
 
 
 @pytest.mark.parametrize(("steps", "says"), [(2, "by Lanczos"), (2000, "by power iteration")])
 def test_a_power_iteration_that_did_not_arrive_gives_no_index(steps, says):
     operator, generator = DenseOperator(torch.diag(torch.linspace(-1, 3, 40, dtype=torch.float64))), torch.Generator()
     power = power_ends(operator, generator.manual_seed(0), PowerSettings(rtol=1e-9, max_matvecs=steps))
-    index = literal_index(extreme_eigenpairs(operator, generator), power)
+    index = paper_index(extreme_eigenpairs(operator, generator), power)
     assert index.value == pytest.approx(-3, rel=1e-2) and index.note.startswith(says)
     assert None not in (index.low, index.value, index.high) and index.low <= index.value <= index.high  # pyright: ignore[reportOptionalOperand, reportOperatorIssue]
 
@@ -85,9 +85,9 @@ def test_in_an_open_bracket_a_power_iteration_that_ran_out_did_not_arrive():
     late, arrived = (
         power_ends(operator, generator, PowerSettings(0.1, atol=1e-2, max_matvecs=steps)) for steps in (2, 3000)
     )
-    index = literal_index(ends, late)
+    index = paper_index(ends, late)
     assert index.high is None and index.note.startswith("by Lanczos: the paper's power iteration did not arrive")
-    assert literal_index(ends, arrived).note.startswith("by power iteration")
+    assert paper_index(ends, arrived).note.startswith("by power iteration")
 
 
 def test_the_slice_has_true_losses_along_the_two_steepest_directions(record, dense):
@@ -159,7 +159,7 @@ def test_positions_are_split_along_and_across_the_rays(record, dense):
 def test_the_share_within_gaussians_blocks_is_that_of_the_dense_hessian(record, dense):
     objective, H, _, _ = dense
     found = record.data.block_shares
-    assert [(one.operator, one.coupled) for one in found] == [
+    assert [(one.operator, one.ssim_window) for one in found] == [
         ("hessian", True),
         ("gauss-newton", True),
         ("hessian", False),

@@ -126,16 +126,16 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     assert f"no surface is drawn; landscape slice {run / 'checkpoint.pt'} renders more" in " ".join(said.out.split())
     assert data.finite_probe is None and "the finite probe was left out" in data.notes
     assert data.depth is None and "positions along and across the rays were left out" in data.notes
-    assert data.anisotropy.share.value is None and "density" not in data.timing
+    assert data.anisotropy.top_mass.value is None and "density" not in data.timing
     assert "the spectral density was left out, and the indices that need it" in data.notes
     skips = data.skipped
     assert skips["entries_behind_opaque_fronts"].seconds_saved is None
     assert skips["gaussians_out_of_sight"].count == data.counts.skipped_gaussians
     for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
         assert f"trace of {label}" in said.out
-    for label in ("largest eigenvalue", "smallest eigenvalue", "literal", "saddle", "checks passed"):
+    for label in ("largest eigenvalue", "smallest eigenvalue", "eigenvalue_ratio", "negative_ratio", "checks passed"):
         assert label in said.out
-    assert "effective rank" not in said.out and "not necessarily the end" in " ".join(said.out.split())
+    assert "participation ratio" not in said.out and "not necessarily the end" in " ".join(said.out.split())
     assert str(run / "probe-quick" / "report.html") in said.out and "probe.json" in said.out
     for stage in ("traces", "eigenvalues", "slice"):
         assert stage in said.err
@@ -163,7 +163,7 @@ def test_time_that_ends_is_said_and_the_same_command_continues_to_the_same_numbe
     data, said = read_record(out).data, " ".join(capsys.readouterr().out.split())
     assert data.eigenvalues.max.reason == "time budget" and data.slice is None and data.depth is None
     assert any("time ended before: renders, slice, density, finite probe, depth" in note for note in data.notes)
-    assert data.anisotropy.share.value is None
+    assert data.anisotropy.top_mass.value is None
     # what is not known is no number, and the command that resolves it is named
     assert "steepest – (not reached)" in said and "λ max" not in said
     assert f"landscape probe {run / 'double.pt'} --out {out} --slice-points 5" in said

@@ -63,7 +63,7 @@ def test_two_processes_write_the_record_of_one(checkpoint, tmp_path):
 def test_what_a_clock_decides_or_one_process_has_to_hold_is_refused(checkpoint):
     for wrong, words in (
         (["--seconds", "5"], "expected --seconds inf under torchrun"),
-        (["--families"], "in one process"),
+        (["--per-attribute"], "in one process"),
     ):
         done = shared("probe", str(checkpoint), *wrong)
         assert done.returncode != 0 and words in done.stderr

@@ -116,7 +116,7 @@ def test_a_record_may_have_no_slice_and_no_arrays(tmp_path):
         (lambda d: d.update(notes=None), '`array`, got None as "notes"'),
         (lambda d: d.update(notes=[3]), r'`str`, got 3 as "notes\[0\]"'),
         (lambda d: d["notes"].append("NaN"), r'`str`, got nan as "notes\[1\]"'),
-        (lambda d: d["anisotropy"].update(saddle=3.0), 'got 3.0 as "anisotropy.saddle"'),
+        (lambda d: d["anisotropy"].update(negative_ratio=3.0), 'got 3.0 as "anisotropy.negative_ratio"'),
         (lambda d: d["traces"]["quats"].update(value=[1.0]), r'got \[1.0\] as "traces.quats.value"'),
         (lambda d: d["traces"]["quats"].update(standard_error=-1.0), 'at least 0, got -1.0 as "traces.quats"'),
         (lambda d: d["traces"]["sh"].update(sign="?"), 'invalid enum value .* as "traces.sh.sign"'),
@@ -394,12 +394,16 @@ def test_damaged_trajectories_are_refused_by_file_and_column(tmp_path):
 
 CONTRADICTIONS = {
     "ends in the wrong order": lambda data: data["eigenvalues"]["max"].update(value=-500.0),
-    "a share above one": lambda data: data["anisotropy"]["share"].update(value=7.0, low=None, high=None),
+    "a mass above one": lambda data: data["anisotropy"]["top_mass"].update(value=7.0, low=None, high=None),
     "a rank below 0": lambda data: data["anisotropy"].update(
-        effective_rank={"value": -3.0, "low": None, "high": None, "note": ""}
+        participation_ratio={"value": -3.0, "low": None, "high": None, "note": ""}
     ),
-    "an index above its bracket": lambda data: data["anisotropy"]["saddle"].update(value=9.0, low=1.0, high=2.0),
-    "an index below half a bracket": lambda data: data["anisotropy"]["saddle"].update(value=9.0, low=10.0, high=None),
+    "an index above its bracket": lambda data: data["anisotropy"]["negative_ratio"].update(
+        value=9.0, low=1.0, high=2.0
+    ),
+    "an index below half a bracket": lambda data: data["anisotropy"]["negative_ratio"].update(
+        value=9.0, low=10.0, high=None
+    ),
     "an interval the wrong way": lambda data: data["traces"]["means"].update(low=1e6, high=1.0),
     "more in sight than there are": lambda data: data["counts"].update(visible_gaussians=10**9),
     "more views than all": lambda data: data["counts"].update(views_of=1, views=3),

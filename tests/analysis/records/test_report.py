@@ -211,11 +211,11 @@ def test_the_five_numbers_carry_their_errors_and_one_without_bracket_is_none():
     assert found["most negative curvature, λ min, per stored unit²"] == "−220.0 ± 3.0"
     assert found["trace of position, the largest of five in their own units"] == "(3.991 ± 0.093) × 10⁵"
     assert found["λ max / |λ min|, of opposite signs"] == "140.9 ± 2.1"
-    data["anisotropy"]["literal"] |= {"value": -361.0, "low": 0.0, "high": None}
+    data["anisotropy"]["eigenvalue_ratio"] |= {"value": -361.0, "low": 0.0, "high": None}
     found = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
     assert [value for words, value in found.items() if words.startswith("λ max / |λ min|")] == ["–"]
     data["eigenvalues"]["min"] |= {"value": 5.0}
-    data["anisotropy"]["literal"] |= {"value": 6200.0, "low": 3900.0, "high": 15500.0}
+    data["anisotropy"]["eigenvalue_ratio"] |= {"value": 6200.0, "low": 3900.0, "high": 15500.0}
     found = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
     assert found["smallest curvature, λ min, per stored unit²"] == "5.0 ± 3.0"
     assert found["λ max / λ min (3900 … 1.55 × 10⁴)"] == "6200"
@@ -393,7 +393,7 @@ def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, found)
     assert lines["negative"].startswith("−220 (" + over.removeprefix(", ").replace("330", "−330"))
     assert lines["negative"].endswith(f"90% on Gaussian 3,739, a needle, 158 : 1 in the picture, turned; {said}")
     assert found in sentences(data) and "λ max / λ min" not in str(lines)
-    assert ("times as curved as the steepest down" in sentences(data)) == (confirmed is True)
+    assert ("times as curved as the steepest up" in sentences(data)) == (confirmed is True)
     tiles = [each["words"] for each in numbers(probe_of(data))]
     assert any(words.startswith("λ max / |λ min|") for words in tiles) == (confirmed is True)
 
@@ -460,24 +460,21 @@ def test_the_findings_say_how_much_of_the_slice_is_interpolated():
     assert "from 80 of 357 renders, and no surface is drawn; landscape slice" in sentences(data)
 
 
-def test_an_unbounded_ratio_is_given_by_its_bound():
+def test_a_ratio_without_a_bound_is_not_determined():
     data, _ = synthetic()
-    data["anisotropy"]["saddle"] = {"value": None, "low": 40.0, "high": None, "note": "the small end is not resolved"}
-    assert "at least 40.0 times as curved as the steepest down (the small end is not resolved)" in sentences(data)
-    data["anisotropy"]["saddle"]["low"] = 0.0  # which says nothing
-    assert "times as curved" not in sentences(data)
-    assert "is not determined (the small end is not resolved)" in sentences(data)
+    data["anisotropy"]["negative_ratio"] = {"value": None, "low": 0.0, "high": 0.02, "note": "not resolved"}
+    assert "times as curved" not in sentences(data) and "is not determined (not resolved)" in sentences(data)
 
 
 def test_the_ends_of_a_narrow_interval_are_told_apart():
     data, _ = synthetic()
-    data["anisotropy"]["saddle"] |= {"value": 2.602, "low": 2.6012, "high": 2.6034}
+    data["anisotropy"]["negative_ratio"] |= {"value": 2.602, "low": 2.6012, "high": 2.6034}
     assert "(between 2.601 and 2.603)" in sentences(data)
 
 
 def test_a_share_and_its_bracket_have_the_same_unit():
     data, _ = synthetic()
-    data["anisotropy"]["share"] = {"value": 0.008, "low": 0.00627, "high": 0.00954, "note": ""}
+    data["anisotropy"]["top_mass"] = {"value": 0.008, "low": 0.00627, "high": 0.00954, "note": ""}
     assert "holds 0.80% of all absolute curvature (between 0.63% and 0.95%)." in sentences(data)
 
 
@@ -499,10 +496,10 @@ def test_needles_are_counted_and_notes_are_sentences():
 @pytest.mark.parametrize(
     ("index", "settings", "reason", "command"),
     [
-        ("share", {"density_matvecs": 108}, "tolerance", "landscape probe run --out there --density-products 432"),
-        ("literal", {}, "time budget", "landscape probe run --out there"),
-        ("literal", {}, "matvec budget", "landscape probe run --out there --end-products 60"),
-        ("literal", {}, "noise floor", None),
+        ("top_mass", {"density_matvecs": 108}, "tolerance", "landscape probe run --out there --density-products 432"),
+        ("eigenvalue_ratio", {}, "time budget", "landscape probe run --out there"),
+        ("eigenvalue_ratio", {}, "matvec budget", "landscape probe run --out there --end-products 60"),
+        ("eigenvalue_ratio", {}, "noise floor", None),
     ],
 )
 def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_resolves_it(
@@ -526,24 +523,24 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
 
 def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution(tmp_path):
     data, arrays = synthetic()
-    data["anisotropy"]["saddle"] = {"value": 97.31, "low": 15.0, "high": 151.0, "note": "4 start vectors"}
-    (line,) = (line for line in findings(probe_of(data)) if line.text.startswith("Saddle"))
-    assert line.level == "caution" and "– (between 15.0 and 151)" in line.text
+    data["anisotropy"]["negative_ratio"] = {"value": 0.009731, "low": 0.0015, "high": 0.0151, "note": "4 starts"}
+    (line,) = (line for line in findings(probe_of(data)) if line.text.startswith("Negative ratio"))
+    assert line.level == "caution" and "– (between 0.00150 and 0.0151)" in line.text
     text = Page(page(tmp_path / "probe", data, arrays)).text
-    assert "97.3" not in text
-    data["anisotropy"]["literal"] = {"value": -97.31, "low": -151.0, "high": -15.0, "note": ""}
+    assert "0.00973" not in text
+    data["anisotropy"]["eigenvalue_ratio"] = {"value": -97.31, "low": -151.0, "high": -15.0, "note": ""}
     data["depth"] = depth_section() | {"curvature_ratio": {"value": 97.31, "low": 15.0, "high": 151.0, "note": ""}}
     assert "97.3" not in sentences(data) and "97.3" not in " ".join(summary(probe_of(data), Path()))
-    data["anisotropy"]["saddle"]["high"] = 149.0
-    assert not any(line.text.startswith("Saddle") for line in findings(probe_of(data)))
+    data["anisotropy"]["negative_ratio"]["high"] = 0.0149
+    assert not any(line.text.startswith("Negative ratio") for line in findings(probe_of(data)))
 
 
 def test_names_and_notes_that_look_like_markup_are_printed_as_they_are():
     data, _ = synthetic()
     data["checks"]["[/x]"] = data["checks"].pop("symmetry")
-    data["anisotropy"]["literal"]["note"] = "[/note]"
+    data["anisotropy"]["eigenvalue_ratio"]["note"] = "[/note]"
     example = json.loads((Path(__file__).parent / "examples" / "probe.json").read_text())
-    data["families"] = [example["families"][0] | {"unit": "[/unit]", "block": "[/block]"}]
+    data["per_attribute"] = [example["per_attribute"][0] | {"unit": "[/unit]", "block": "[/block]"}]
     console = Console(width=140, file=StringIO())
     record = probe_of(data)
     console.print(probe_table(record, 140), family_table(record))

@@ -39,7 +39,9 @@ def record(folder: Path, scale: float, **changes) -> None:
     """A record in place of a probe, with the split control."""
     data, arrays = synthetic(scale)
     data["provenance"] |= {"iteration": ITERATIONS} | own(folder.parent) | changes
-    effects = [{"operator": "hessian", "block": block, "index": "saddle", **FACTOR} for block in ("all", "means")]
+    effects = [
+        {"operator": "hessian", "block": block, "index": "negative_ratio", **FACTOR} for block in ("all", "means")
+    ]
     data["split_control"] = {
         "gaussians": 20182,
         "rms": 0.01 * scale,
@@ -50,11 +52,11 @@ def record(folder: Path, scale: float, **changes) -> None:
     end = {"value": 4.0, "residual": 0.1, "reason": "tolerance"}
     about = {"operator": "hessian", "block": "means", "metric": "parameters", "unit": "stored units", "split": False}
     index = {"value": 7.0 * scale, "low": 6.0 * scale, "high": 9.0 * scale, "note": ""}
-    names = ("literal", "saddle", "share", "effective_rank")
+    names = ("eigenvalue_ratio", "negative_ratio", "top_mass", "participation_ratio")
     family = {"gaussians": 10091, "dim": 30273, "rank": 30000, "lambda_max": end, "lambda_min": end}
     share = {name: value / 10 if name != "note" else value for name, value in index.items()}
-    family |= {"indices": dict.fromkeys(names, index) | {"share": share}}
-    data["families"] = [about | family, about | family | {"split": True, "gaussians": 20000}]
+    family |= {"indices": dict.fromkeys(names, index) | {"top_mass": share}}
+    data["per_attribute"] = [about | family, about | family | {"split": True, "gaussians": 20000}]
     written(folder, data, arrays)
 
 
@@ -93,7 +95,9 @@ def changed(run: str, **config) -> None:
 
 def other_units(run: str) -> dict:
     """A family of the run in other units."""
-    return json.loads((Path(run) / "probe/probe.json").read_text())["families"][0] | {"unit": "steps of the optimiser"}
+    return json.loads((Path(run) / "probe/probe.json").read_text())["per_attribute"][0] | {
+        "unit": "steps of the optimiser"
+    }
 
 
 def refused(capsys, words: list[str], *expected: str) -> None:
@@ -131,10 +135,12 @@ def test_the_file_holds_the_numbers_of_the_records_and_metrics(trained, tmp_path
         expected = {
             ("trace", "rotation"): [trace[key] for key in ("value", "low", "high")],
             ("spectrum", "largest eigenvalue"): [top["value"] + sign * top["residual"] for sign in (0, -1, 1)],
-            ("anisotropy", "saddle"): [data["anisotropy"]["saddle"][key] for key in ("value", "low", "high")],
-            ("anisotropy", "saddle, split control"): [2.5, 2.0, 3.1],
-            ("families", "Hessian, position: saddle"): [7 * scale, 6 * scale, 9 * scale],
-            ("families", "Hessian, position: saddle, split control"): [2.5, 2.0, 3.1],
+            ("anisotropy", "negative ratio"): [
+                data["anisotropy"]["negative_ratio"][key] for key in ("value", "low", "high")
+            ],
+            ("anisotropy", "negative ratio, split control"): [2.5, 2.0, 3.1],
+            ("per_attribute", "Hessian, position: negative ratio"): [7 * scale, 6 * scale, 9 * scale],
+            ("per_attribute", "Hessian, position: negative ratio, split control"): [2.5, 2.0, 3.1],
         }
         for key, numbers in expected.items():
             assert table.loc[(*key, label)][["value", "low", "high"]].astype(float).tolist() == pytest.approx(
@@ -151,8 +157,8 @@ def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(train
     assert "which hardly changes the image" in page
     for scale in (1.0, 0.5):
         data, _ = synthetic(scale)
-        trace, saddle = data["traces"]["means"], bracketed(Index(**data["anisotropy"]["saddle"]))
-        for text in (measured(trace["value"], trace["standard_error"]), saddle.value, "× 2.50", "2.00 … 3.10"):
+        trace, ratio = data["traces"]["means"], bracketed(Index(**data["anisotropy"]["negative_ratio"]))
+        for text in (measured(trace["value"], trace["standard_error"]), ratio.value, "× 2.50", "2.00 … 3.10"):
             assert text in said and text in page
         assert (
             f"by {quantity(0.01 * scale)} (root mean square; {quantity(40 / scale)} dB), and 182 of the halves" in page
@@ -309,7 +315,7 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
 def test_what_holds_of_many_runs_is_said_once_and_seeds_may_differ(runs, capsys, no_pictures):
     data, arrays = synthetic()
     data["checks"]["symmetry"]["passed"] = False
-    data["anisotropy"]["share"] |= {"value": None, "low": None, "high": None}
+    data["anisotropy"]["top_mass"] |= {"value": None, "low": None, "high": None}
     for run, seed in zip(runs, (0, 3), strict=True):
         changed(run, seed=seed)
         data["provenance"] |= {"iteration": ITERATIONS} | own(Path(run))
@@ -328,10 +334,10 @@ def trained_again(runs: list[str]) -> Path:
 
 
 def test_families_that_only_one_run_has_are_in_no_other_units(runs, capsys, no_pictures):
-    words, folder = "The units of the families are not the same.", Path(runs[1]) / "probe"
+    words, folder = "The units of --per-attribute are not the same.", Path(runs[1]) / "probe"
     data, arrays = synthetic()
     data["provenance"] |= {"iteration": ITERATIONS} | own(Path(runs[1]))
-    for changes, said in (({"families": []}, False), ({"families": [other_units(runs[0])]}, True)):
+    for changes, said in (({"per_attribute": []}, False), ({"per_attribute": [other_units(runs[0])]}, True)):
         written(folder, data | changes, arrays)
         assert main(["compare", *runs]) == 0
         assert (words in capsys.readouterr().out) == said

@@ -42,13 +42,13 @@ def test_indices_that_contradict_each_other_are_told():
         return sayings(grouped(rows, SINGLE), SINGLE)[-1]
 
     def rank(*values: float, half: float) -> Row:
-        return row("anisotropy", "effective rank", *values, half=half)
+        return row("anisotropy", "participation ratio", *values, half=half)
 
-    share = row("anisotropy", "share", 0.1, 0.2, half=0.01)
-    contradict = "by share sam is the more anisotropic, but by effective rank plain is the more anisotropic."
+    share = row("anisotropy", "top mass", 0.1, 0.2, half=0.01)
+    contradict = "by top mass sam is the more anisotropic, but by participation ratio plain is the more anisotropic."
     assert said(share, rank(50.0, 90.0, half=5.0)) == f"The indices contradict each other: {contradict}"
     agree = "The indices that decide ({}) agree: sam is the more anisotropic of sam and plain."
-    assert said(share, rank(90.0, 50.0, half=5.0)) == agree.format("share, effective rank")
-    assert said(share, rank(50.0, 90.0, half=30.0)) == agree.format("share")
+    assert said(share, rank(90.0, 50.0, half=5.0)) == agree.format("top mass, participation ratio")
+    assert said(share, rank(50.0, 90.0, half=30.0)) == agree.format("top mass")
     assert said(rank(50.0, 90.0, half=30.0)) == "No index decides whether sam and plain differ in anisotropy."
     assert "not known of groups of one run" in sayings(grouped([share], SINGLE), SINGLE)[0]

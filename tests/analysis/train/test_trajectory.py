@@ -122,8 +122,8 @@ def test_a_row_is_the_landscape_within_its_errors(at_the_end, tmp_path):
         block = objective.blocks[name]
         exact = float(H[block, block].trace())
         assert abs(row[f"trace_{name}"] - exact) <= 4 * row[f"trace_{name}_error"] + rounding
-    known = {"literal": values[-1] / values[0], "saddle": -values[-1] / values[0]}
-    known |= {"share": values[-1] / values.abs().sum()}
+    known = {"eigenvalue_ratio": values[-1] / values[0], "negative_ratio": -values[-1] / values[0]}
+    known |= {"top_mass": values[-1] / values.abs().sum()}
     for index, value in known.items():
         assert row[f"{index}_low"] - 1e-6 <= float(value) <= row[f"{index}_high"] + 1e-6, index
 
@@ -189,7 +189,7 @@ def test_a_record_between_is_as_fine_as_its_time_beside_that_of_the_last(along, 
     (row,) = along.rows
     assert row["state"] == state
     assert (row["note"] == "") == (state != "skipped") and pd.notna(row.get("lambda_max")) == (state != "skipped")
-    assert pd.notna(row.get("effective_rank")) == (state == "whole")
+    assert pd.notna(row.get("participation_ratio")) == (state == "whole")
     if state == "skipped":
         assert row["note"] == "no time: 10 s were needed at least, 9 s were allowed" and row["seconds"] == 0
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from splat.model.camera import Camera
-from splat.scenes.view import Frame, Photograph, Points, Shelf, View, inside_image, pixel_coordinates
+from splat.scenes.view import Frame, Photograph, Points, View, ViewCache, inside_image, pixel_coordinates
 
 
 def camera(x: float = 0.0) -> Camera:
@@ -76,7 +76,7 @@ def test_a_shelf_keeps_the_pictures_used_last_and_reads_the_others_again(monkeyp
         return Frame(name, camera(), picture, layers=layers)
 
     frames = [made("a"), made("b"), made("c", frozenset({"mask"}))]
-    shelf = Shelf(2 * frames[0].bytes)
+    shelf = ViewCache(2 * frames[0].bytes)
     views = [Photograph(each, shelf) for each in frames]
     assert [view.name for view in views] == ["a", "b", "c"] and views[0].alpha is views[0].mask is None and not read
     for i in (0, 1, 0):

@@ -45,13 +45,13 @@ ROUNDOFF = 1e-7  # of L: a smaller decrease is lost in the rounding of renders
 class SecondOrder(MethodSettings):
     """damping: the first lambda; floor: see `damped_blocks.py`.  curvature: which matrix is H, Gauss-Newton or the Hessian.
 
-    coupling: False leaves out SSIM's coupling of pixels from H and its blocks, as published methods do.
+    ssim_window: False leaves out SSIM's window from H and its blocks, as published methods do.
     """
 
     damping: Positive = 1.0
     floor: NonNegative = 1.0
     curvature: Literal["gauss-newton", "hessian"] = "gauss-newton"
-    coupling: bool = True
+    ssim_window: bool = True
     ITERATIONS: ClassVar[int] = 50
 
     def density_control(self, config: TrainConfig) -> DensifySettings:
@@ -75,11 +75,11 @@ class LocalModel:
         self.objective, self.mask, gauss_newton = objective, objective.mask, settings.curvature == "gauss-newton"
         self.each = len(objective.active.flat) // len(objective.active)
         self.loss = sum(view.value for view in objective.linearized) / len(objective.views)
-        blocks = objective.block_diagonal(gauss_newton=gauss_newton, approximate=not settings.coupling, traced=False)
+        blocks = objective.block_diagonal(gauss_newton=gauss_newton, approximate=not settings.ssim_window, traced=False)
         self.metric = DampedBlocks(objective.active, blocks, settings.floor)
-        H = SceneHessian(objective, gauss_newton=gauss_newton, keep_null=True, coupled=settings.coupling)
+        H = SceneHessian(objective, gauss_newton=gauss_newton, keep_null=True, ssim_window=settings.ssim_window)
         self.A = CountingOperator(ScaledOperator(ProjectedOperator(H, self.metric.project), self.metric.scale))
-        coupled = settings.coupling and objective.couples_pixels
+        coupled = settings.ssim_window and objective.couples_pixels
         # for each view: visibility, forward, backward, and one or two for blocks
         self.passes = len(objective.views) * (5 if coupled else 4)
         self.b = -self.metric.scale * self.metric.project(objective.gradient[:, None])[:, 0]
@@ -126,10 +126,10 @@ class SecondOrderMethod(Method[S], Generic[S]):
                 f"expected clamp_image=false for {name}, whose Hessian is that of the image before it is clamped"
             )
         exact = backend_of(training.gaussians.flat).exact_blocks
-        if not exact and self.settings.coupling and config.loss.ssim_weight:
+        if not exact and self.settings.ssim_window and config.loss.ssim_weight:
             raise InputError(
                 f"expected --device cpu for {name}: the exact blocks of a loss with SSIM are made there alone; give it, or "
-                "--set coupling=false, or --ssim-weight 0"
+                "--set ssim_window=false, or --ssim-weight 0"
             )
 
     def propose(self, local: LocalModel, damping: float) -> Proposal:

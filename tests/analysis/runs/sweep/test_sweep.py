@@ -320,11 +320,15 @@ def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, fold
     recorded.written(cell.out / "probe", data, arrays)
     try:
         assert missing(cell, with_probe) == [] and missing(cell, control) == ["probe"]
-        assert probe_arguments(cell, control)[4:] == ["--split-control", "--family-seconds", "7.0"]
+        assert probe_arguments(cell, control)[4:] == ["--split-control", "--per-attribute-seconds", "7.0"]
         row = results([cell], {cell.name: "done"}).iloc[0]
         assert row["trace_means"] == data["traces"]["means"]["value"] and row["lambda_min_error"] == 3.0
-        assert (row["saddle_low"], row["saddle_high"]) == (139.0, 143.0) and row["share"] is None
-        data["provenance"] |= recorded.own(cell.out, split_control=True, family_seconds=7.0)  # more than was asked for
+        assert (row["negative_ratio_low"], row["negative_ratio_high"]) == (1 / 143.0, 1 / 139.0) and row[
+            "top_mass"
+        ] is None
+        data["provenance"] |= recorded.own(
+            cell.out, split_control=True, per_attribute_seconds=7.0
+        )  # more than was asked for
         recorded.written(cell.out / "probe", data, arrays)
         assert missing(cell, with_probe) == missing(cell, control) == []
         for other in ({"loss": "3dgs", "seed": 1}, {"quick": True}):

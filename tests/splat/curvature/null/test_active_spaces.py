@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from analysis.measures.units import optimiser_units
-from landscape import ScaledOperator, families
+from landscape import ScaledOperator, block_anisotropies
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.null.active_spaces import active_spaces
 from splat.curvature.objective import SceneObjective
@@ -54,14 +54,14 @@ def test_the_indices_of_every_attribute_are_those_of_its_dense_block(
     H = hessian.apply(torch.eye(hessian.dim, dtype=torch.float64))
     runs, misses, spaces = 6, Counter(), active_spaces(objective, hessian.projector)
     for seed in range(runs):
-        for name, part in families(hessian, torch.Generator().manual_seed(seed), active=spaces).items():
+        for name, part in block_anisotropies(hessian, torch.Generator().manual_seed(seed), active=spaces).items():
             rows = hessian.blocks.get(name, slice(0, hessian.dim))
             true = torch.linalg.eigvalsh((H[rows, rows] + H[rows, rows].T) / 2)
             total = float(true.abs().sum())
-            share, rank = part.indices.share, part.indices.effective_rank
+            share, rank = part.indices.top_mass, part.indices.participation_ratio
             assert share is not None and rank is not None and rank.high <= part.rank
             largest, spread = float(true[-1]) / total, total**2 / float(true.square().sum())
-            misses[name, "share"] += not share.low <= largest * (1 + 1e-9) <= share.high * (1 + 2e-9)
+            misses[name, "top_mass"] += not share.low <= largest * (1 + 1e-9) <= share.high * (1 + 2e-9)
             misses[name, "rank"] += not rank.low <= spread * (1 + 1e-9) <= rank.high * (1 + 2e-9)
     # 95% brackets: four misses of six have a probability of 9e-5
     assert max(misses.values()) < 4, misses

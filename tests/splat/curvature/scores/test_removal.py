@@ -41,14 +41,14 @@ LOSSES = [LossSettings(), LossSettings("charbonnier", ssim_weight=0.4), LossSett
 @pytest.mark.parametrize("loss", LOSSES, ids=["3DGS", "smooth", "MCMC"])
 def test_the_predicted_rise_is_the_second_order_of_removal(loss):
     objective = toy(loss)
-    rise = removal_scores(objective, toy(L2))["rise"]
+    rise = removal_scores(objective, toy(L2))["removal_error"]
     exact = np.array([along_removal(objective, i) for i in range(len(rise))])
     assert np.abs(rise.numpy() - exact).max() <= 1e-10 * np.abs(exact).max()
 
 
 def test_for_squared_errors_the_prediction_is_the_true_rise():
     objective = toy(L2)
-    rise = removal_scores(objective, objective)["rise_l2"]
+    rise = removal_scores(objective, objective)["removal_error_l2"]
     true = removal_errors(objective, torch.arange(len(rise)))
     assert (true.abs() > 0).all() and (rise - true).abs().max() <= 1e-10 * true.abs().max()
 
@@ -59,7 +59,7 @@ def test_opaque_gaussians_are_scored_by_their_removal(logit, dtype):
     gaussians = random_gaussians(8, sh_degree=1, seed=4, logit=-0.5, spread=0.5).to(dtype)
     gaussians.opacity_logits[:4] = logit
     objective = SceneObjective(gaussians, two_views(), L2, BACKGROUND.to(dtype), SMOOTH)
-    rise = removal_scores(objective, objective)["rise_l2"]
+    rise = removal_scores(objective, objective)["removal_error_l2"]
     true = removal_errors(objective, torch.arange(len(rise)))
     # 1 - omega at the logit OPAQUE, and twice its rounding in single precision; the loss is known to round-off
     bound = 1e-3 * true.abs() + 100 * torch.finfo(dtype).eps * objective.loss(objective.active.flat)

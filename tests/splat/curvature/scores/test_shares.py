@@ -58,7 +58,7 @@ def test_shares_are_those_of_dense_matrices(loss):
     found = block_shares(objective, torch.Generator().manual_seed(0), samples=512)
     assert len(found) == (4 if objective.couples_pixels else 2)
     for one in found:
-        H = dense(objective, one.gauss_newton, one.coupled)
+        H = dense(objective, one.gauss_newton, one.ssim_window)
         assert one.error < 0.06
         assert abs(one.norm / (H**2).sum() - 1) < 4 * one.error
         # numerators are exact: their ratios have no error

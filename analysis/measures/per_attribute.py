@@ -1,6 +1,6 @@
 """Anisotropy of a checkpoint's curvature: of all attributes together and of each, of the Hessian and of Gauss-Newton.
 
-A family is both ends of the spectrum, the density and the indices (`landscape.spectrum.families`) of one of these:
+A family is both ends of the spectrum, the density and the indices (`landscape.spectrum.block_anisotropy`) of one of these:
 
     scene       "trained": the checkpoint; "split": with every Gaussian in sight split into two coincident halves
                 (`analysis.measures.split_control`), which leaves the images nearly unchanged
@@ -29,13 +29,13 @@ from analysis.measures.split_control import SplitControl, split_control
 from analysis.measures.units import Metric, optimiser_units, scene_size, scene_units
 from analysis.records import schema
 from analysis.records.records import ProbeRecord
-from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
+from landscape import BlockAnisotropy, BlockAnisotropySettings, Bracket, ScaledOperator, block_anisotropies
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, finished
 from landscape.probes import spawn
 from landscape.results import Progress, finite_or_none
-from landscape.spectrum.families import WHOLE, Lead
+from landscape.spectrum.block_anisotropy import WHOLE, WarmStart
 from landscape.traces.trace import total_trace
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
@@ -55,7 +55,7 @@ DENSITY_SHARE = 0.45  # of a family's time, as by default 48 of its 108 products
 
 
 @dataclass(frozen=True)
-class FamilyOptions:
+class PerAttributeOptions:
     """Metric, split control and budget of the families.
 
     family: budget of each; seconds: for all of them together; memory: GiB for the vectors of a basis.
@@ -63,14 +63,14 @@ class FamilyOptions:
 
     metric: Metric = "parameters"
     split_control: bool = False
-    family: FamilySettings = field(default_factory=FamilySettings)
+    family: BlockAnisotropySettings = field(default_factory=BlockAnisotropySettings)
     seconds: float = inf
     memory: float = 2.0
 
     def __post_init__(self) -> None:
         if not (self.seconds > 0 and self.memory > 0):
             raise InputError(
-                f"expected seconds and memory above 0 for the families, got {self.seconds} and {self.memory}"
+                f"expected seconds and memory above 0 for --per-attribute, got {self.seconds} and {self.memory}"
             )
 
     @property
@@ -86,18 +86,18 @@ class FamilyOptions:
 
 @dataclass(frozen=True, eq=False)
 class FamilyRow:
-    """One family.  dim: rows of the block, its null space included (see `Family.rank`)."""
+    """One family.  dim: rows of the block, its null space included (see `BlockAnisotropy.rank`)."""
 
     scene: SceneName
     operator: schema.Operator
     block: str
     gaussians: int
     dim: int
-    family: Family
+    family: BlockAnisotropy
 
-    def record(self, metric: Metric, unit: str) -> schema.Family:
+    def record(self, metric: Metric, unit: str) -> schema.BlockAnisotropy:
         found, ends = self.family, self.family.ends
-        return schema.Family(
+        return schema.BlockAnisotropy(
             metric=metric,
             unit=unit,
             operator=self.operator,
@@ -139,7 +139,9 @@ class FamilyFindings:
                 psnr=psnr,
                 effects=list(self.effects),
             )
-        return structs.replace(record, families=families, split_control=control, notes=[*record.notes, *self.notes])
+        return structs.replace(
+            record, per_attribute=families, split_control=control, notes=[*record.notes, *self.notes]
+        )
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Nodes and weights of every density."""
@@ -150,10 +152,10 @@ class FamilyFindings:
         }
 
 
-def measure_families(
+def measure_per_attribute(
     objective: SceneObjective,
     training: Training,
-    options: FamilyOptions,
+    options: PerAttributeOptions,
     generator: torch.Generator,
     stage: Stage,
     ends: EigenEnds | None = None,
@@ -191,7 +193,7 @@ def measure_families(
 
 
 def _stage_of(scene: SceneName, operator: schema.Operator) -> str:
-    return f"families: {operator}{', split' if scene == 'split' else ''}"
+    return f"per attribute: {operator}{', split' if scene == 'split' else ''}"
 
 
 def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:
@@ -238,12 +240,12 @@ def _of_operator(
     hessian: SceneHessian,
     scale: Tensor | None,
     ends: EigenEnds | None,
-    options: FamilyOptions,
+    options: PerAttributeOptions,
     generator: torch.Generator,
     seconds: Callable[[], float],
     report: Progress,
     notes: list[str],
-) -> list[tuple[str, int, Family]]:
+) -> list[tuple[str, int, BlockAnisotropy]]:
     """(block, dim, family) of the whole and of every attribute of one operator.
 
     ends: of the whole, where known.  seconds: the time of the next family.  notes: gets sentences on what was left out.
@@ -264,8 +266,10 @@ def _of_operator(
             report(done, len(names), state)
 
         dim = hessian.dim if name == WHOLE else hessian.blocks[name].stop - hessian.blocks[name].start
-        lead = Lead(_start(hessian, name, scale, ends), traces.get(name))
-        found.append((name, dim, families(operator, stream, settings, [name], spaces, say, {name: lead})[name]))
+        lead = WarmStart(_start(hessian, name, scale, ends), traces.get(name))
+        found.append(
+            (name, dim, block_anisotropies(operator, stream, settings, [name], spaces, say, {name: lead})[name])
+        )
     report(len(names), len(names), "done")
     return found
 
@@ -307,8 +311,8 @@ def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: Scene
 
 
 def _fitted(
-    objective: SceneObjective, options: FamilyOptions, seconds: float, product: float, notes: list[str]
-) -> FamilySettings:
+    objective: SceneObjective, options: PerAttributeOptions, seconds: float, product: float, notes: list[str]
+) -> BlockAnisotropySettings:
     """The budget of a family that is given so many seconds: basis and batch fit into memory, both searches into the time.
 
     product: seconds of a product with a batch of vectors.  notes: gets sentences on what was cut down.

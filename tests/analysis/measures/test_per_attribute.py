@@ -16,14 +16,27 @@ from rich.console import Console
 from scipy.stats import binom
 
 from analysis.commands.cli import main
-from analysis.measures.families import FamilyFindings, FamilyOptions, _seconds_a_product, measure_families, quotient
+from analysis.measures.per_attribute import (
+    FamilyFindings,
+    PerAttributeOptions,
+    _seconds_a_product,
+    measure_per_attribute,
+    quotient,
+)
 from analysis.measures.split_control import split_in_two
 from analysis.probe.command import scene_objective
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.report import render_report
 from analysis.records.schema import INDICES, End, Index
 from analysis.records.tables import Cell, family_lines, family_table
-from landscape import Bracket, DenseOperator, EigenSettings, FamilySettings, extreme_eigenpairs, families
+from landscape import (
+    BlockAnisotropySettings,
+    Bracket,
+    DenseOperator,
+    EigenSettings,
+    block_anisotropies,
+    extreme_eigenpairs,
+)
 from landscape.eigen.pairs import EigenEnds
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
@@ -36,15 +49,15 @@ from splat.training.densify import ScreenGradients
 from tests.recorded import soft
 
 SCENE = SyntheticSettings(gaussians=50, views=4, width=16, height=12)
-BUDGET = FamilySettings(EigenSettings(rtol=1e-2, max_matvecs=40), starts=3, steps=6)
+BUDGET = BlockAnisotropySettings(EigenSettings(rtol=1e-2, max_matvecs=40), starts=3, steps=6)
 BLOCKS = ["all", "means", "log_scales", "quats", "opacity_logits", "sh"]
-QUICK = ["--quick", "--seconds", "inf", "--slice-points", "5", "--family-seconds", "inf"]
+QUICK = ["--quick", "--seconds", "inf", "--slice-points", "5", "--per-attribute-seconds", "inf"]
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory) -> Path:
     """A checkpoint in double precision beside its scene."""
-    folder = tmp_path_factory.mktemp("families")
+    folder = tmp_path_factory.mktemp("per_attribute")
     write_transforms_scene(synthetic_scene(SCENE).scene, folder / "still")
     command = ["train", str(folder / "still"), "--out", str(folder / "run"), "--iterations", "10", "--no-densify"]
     assert main([*command, "--sh-degree", "1"]) == 0
@@ -75,7 +88,9 @@ def found(
 ) -> FamilyFindings:
     generator = torch.Generator().manual_seed(0)
     options = {"family": BUDGET, **options}
-    return measure_families(objective, checkpoint.training, FamilyOptions(**options), generator, silent, ends)
+    return measure_per_attribute(
+        objective, checkpoint.training, PerAttributeOptions(**options), generator, silent, ends
+    )
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +128,7 @@ def spectra(objective: SceneObjective, checkpoint: Checkpoint, operator: str) ->
 
 def indices(spectrum: torch.Tensor) -> dict[str, float]:
     total = float(spectrum.abs().sum())
-    return {"share": float(spectrum[-1]) / total, "effective_rank": total**2 / float(spectrum.square().sum())}
+    return {"top_mass": float(spectrum[-1]) / total, "participation_ratio": total**2 / float(spectrum.square().sum())}
 
 
 def most_misses(brackets: int, level: float) -> int:
@@ -128,9 +143,9 @@ def of_split(objective: SceneObjective, checkpoint: Checkpoint) -> SceneObjectiv
 
 
 def test_every_stage_of_the_families_has_an_expected_time(record):
-    ran = [name for name in record.data.timing if name.startswith("families")]
-    assert list(FamilyOptions(split_control=True).expected) == ran
-    assert list(FamilyOptions().expected) == [name for name in ran if "split" not in name]
+    ran = [name for name in record.data.timing if name.startswith("per_attribute")]
+    assert list(PerAttributeOptions(split_control=True).expected) == ran
+    assert list(PerAttributeOptions().expected) == [name for name in ran if "split" not in name]
 
 
 @pytest.mark.parametrize("operator", ["hessian", "gauss-newton"])
@@ -168,7 +183,9 @@ def test_the_splits_effect_brackets_the_quotient_of_dense_indices(split, objecti
     held = []
     for operator in ("hessian", "gauss-newton"):
         before, after = (spectra(of, checkpoint, operator) for of in (objective, of_split(objective, checkpoint)))
-        for effect in (e for e in split.effects if e.operator == operator and e.index in ("share", "effective_rank")):
+        for effect in (
+            e for e in split.effects if e.operator == operator and e.index in ("top_mass", "participation_ratio")
+        ):
             true = indices(after[effect.block])[effect.index] / indices(before[effect.block])[effect.index]
             held.append(effect.low <= true <= effect.high)
             values = [getattr(row.family.indices, effect.index).value for row in split.rows if matches(row, effect)]
@@ -206,17 +223,17 @@ def test_the_metrics_have_the_units_that_they_name(objective, checkpoint, split)
 
 
 def test_the_record_and_the_page_hold_every_family_and_what_the_split_does(record, split):
-    rows = record.data.families
+    rows = record.data.per_attribute
     assert len(rows) == 24 and {row.metric for row in rows} == {"optimiser"} and rows[0].unit == split.unit
     assert [row.block for row in rows[:6]] == BLOCKS and sum(row.split for row in rows) == 12
     control = record.data.split_control
     assert control.psnr == pytest.approx(split.control.psnr) and len(control.effects) == 12 * len(INDICES)
-    starts, nodes = record.arrays["families"][
+    starts, nodes = record.arrays["per_attribute"][
         "split.gauss-newton.sh.nodes"
     ].shape  # eigenvalues that are known are nodes, too
     assert starts == rows[-1].starts and nodes >= rows[-1].steps
     page = Tables((record.folder / "report.html").read_text(encoding="utf-8"))
-    lines = page.rows("families")
+    lines = page.rows("per_attribute")
     assert len(lines) == 1 + 3 * 12 and all(len(line) == len(lines[0]) == 7 + len(INDICES) for line in lines)
     assert sum("×" in line[7 + 2] for line in lines if line[2] == "changes by") == 12  # the share
     assert split.unit in page.text
@@ -224,20 +241,20 @@ def test_the_record_and_the_page_hold_every_family_and_what_the_split_does(recor
 
 def test_a_family_whose_small_end_is_not_resolved_is_given_by_its_bound(record):
     data = copy.deepcopy(record.data)
-    indices = data.families[0].indices
-    indices.literal = Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")
-    indices.effective_rank = Index(value=7.0, low=0.0, high=None, note="2 steps")
+    indices = data.per_attribute[0].indices
+    indices.eigenvalue_ratio = Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")
+    indices.participation_ratio = Index(value=7.0, low=0.0, high=None, note="2 steps")
     cells = family_lines(data)[0].indices
     assert cells[0].value == "≥ 34.2" and cells[0].note == "lambda_min is not resolved"
     assert cells[-1].value == "–"  # a bound that says nothing
     page = Tables(render_report(Record(record.folder, data, record.arrays)))
-    assert page.rows("families")[1][7] == "≥ 34.2"
+    assert page.rows("per_attribute")[1][7] == "≥ 34.2"
 
 
 def test_an_end_that_was_not_reached_says_so_with_its_bound(record):
     data = copy.deepcopy(record.data)
-    row = data.families[0]
-    data.families, data.split_control = [row], UNSET
+    row = data.per_attribute[0]
+    data.per_attribute, data.split_control = [row], UNSET
 
     def ends() -> tuple[Cell, ...]:
         return family_lines(data)[0].ends
@@ -250,17 +267,17 @@ def test_an_end_that_was_not_reached_says_so_with_its_bound(record):
     assert ends()[0] == Cell("not reached", "1.90 … 2.60", "time budget")
     row.lambda_min.reason = "tolerance"
     assert soft(ends()[1].value) == "(0.1 ± 2.4) × 10⁻⁴"
-    assert record.data.families[0].beyond is not None
+    assert record.data.per_attribute[0].beyond is not None
 
 
 def test_at_80_columns_every_number_and_label_is_whole(record):
     data = copy.deepcopy(record.data)
     wide = Index(value=-1.234e-4, low=-1.235e-4, high=-1.233e-4, note="")
     bracket = Index(value=8.25e-4, low=7.45e-4, high=1.02e4, note="")
-    for row in data.families:
-        row.indices.literal, row.indices.share, row.indices.effective_rank = wide, bracket, bracket
+    for row in data.per_attribute:
+        row.indices.eigenvalue_ratio, row.indices.top_mass, row.indices.participation_ratio = wide, bracket, bracket
     for effect in data.split_control.effects:
-        numbers = wide if effect.index == "literal" else bracket
+        numbers = wide if effect.index == "eigenvalue_ratio" else bracket
         effect.value, effect.low, effect.high, effect.note = numbers.value, numbers.low, numbers.high, ""
     console = Console(width=80, file=io.StringIO())
     console.print(family_table(data))
@@ -268,7 +285,7 @@ def test_at_80_columns_every_number_and_label_is_whole(record):
     lines = console.file.getvalue().splitlines()
     assert max(map(len, lines)) <= 80
     said = soft("\n".join(lines))
-    for whole in ("Gauss-Newton", "colour (SH)", "  changes by", "effective rank"):
+    for whole in ("Gauss-Newton", "colour (SH)", "  changes by", "participation ratio"):
         assert whole in said
     assert said.count("± 0.0010) × 10⁻⁴") == 36 and said.count("7.45 × 10⁻⁴ …") == said.count("1.02 × 10⁴") >= 72
     assert not re.search(r"\S…", said)  # where text was cut off
@@ -278,7 +295,7 @@ def test_the_families_leave_the_other_numbers_as_they_are(path, record, monkeypa
     monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(lambda target: []))
     assert main(["probe", str(path), *QUICK, "--out", str(path.parent / "plain")]) == 0
     plain = read_record(path.parent / "plain", ProbeRecord)
-    assert not plain.data.families and not plain.data.split_control and "families" not in plain.arrays
+    assert not plain.data.per_attribute and not plain.data.split_control and "per_attribute" not in plain.arrays
     for key in ("traces", "eigenvalues", "anisotropy", "slice"):
         assert getattr(plain.data, key) == getattr(record.data, key)
     assert "Anisotropy by attribute" not in (plain.folder / "report.html").read_text(encoding="utf-8")
@@ -292,12 +309,12 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
     def watched(operator, *given):
         (block,), leads = given[2], given[5]
         seen[of_gauss_newton(operator), block] = operator, leads[block]
-        return families(operator, *given)
+        return block_anisotropies(operator, *given)
 
     def of_gauss_newton(operator):
         return getattr(operator, "inner", operator).gauss_newton
 
-    monkeypatch.setattr("analysis.measures.families.families", watched)
+    monkeypatch.setattr("analysis.measures.per_attribute.block_anisotropies", watched)
     found(objective, checkpoint, metric=metric)
     assert len(seen) == 2 * len(BLOCKS)
     own, pixelwise = objective.approximate_blocks
@@ -324,9 +341,9 @@ def test_the_ends_that_were_looked_for_lead_to_those_of_the_whole(objective, che
 
     def watched(*given):
         leads.append(given[6])
-        return families(*given)
+        return block_anisotropies(*given)
 
-    monkeypatch.setattr("analysis.measures.families.families", watched)
+    monkeypatch.setattr("analysis.measures.per_attribute.block_anisotropies", watched)
     ends = extreme_eigenpairs(SceneHessian(objective), torch.Generator().manual_seed(1), EigenSettings(2, 1))
     found(objective, checkpoint, metric=metric, split_control=True, ends=ends)
     known = torch.stack([ends.largest.vectors[:, 0], ends.smallest.vectors[:, 0]], dim=1)
@@ -364,9 +381,12 @@ def test_memory_bounds_the_vectors_that_are_kept(objective, checkpoint):
 
 def test_a_time_that_is_none_is_refused(path, tmp_path, capsys):
     assert (
-        main(["probe", str(path), "--out", str(tmp_path / "probe"), "--metric", "scene", "--family-seconds", "0"]) == 2
+        main(
+            ["probe", str(path), "--out", str(tmp_path / "probe"), "--metric", "scene", "--per-attribute-seconds", "0"]
+        )
+        == 2
     )
-    assert "above 0 for the families" in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+    assert "above 0 for --per-attribute" in capsys.readouterr().err and list(tmp_path.iterdir()) == []
 
 
 class Tables(HTMLParser):
