@@ -1,14 +1,13 @@
 """What the stages of long work found, kept in a folder until the work is done: the same command continues from there.
 
-A stage writes its result when it ends, in a file of its own and at once.  The folder is for one command: what another one left
-(other settings, another checkpoint, another version) is not read.  Results are dataclasses and `msgspec` structures, whose
-types are checked on reading.
+A stage writes its result when it ends, in a file of its own that begins with a digest of the command and of the content.  What
+another command left (other settings, another checkpoint, another version), or is damaged, is measured again.  Results are
+dataclasses and `msgspec` structures, whose types are checked on reading.
 """
 
-import hashlib
-import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from hashlib import sha256
 from math import inf
 from pathlib import Path
 from time import monotonic
@@ -25,9 +24,9 @@ from landscape.results import Progress
 from splat.training.checkpoint import write_atomically
 
 T = TypeVar("T")
+DIGEST = sha256().digest_size
 Task = Callable[[torch.Generator, Progress, list[str]], T]
 """A stage's work: is given random numbers, whom to tell how far it is, and where to note what it leaves out."""
-DIGEST = hashlib.sha256().digest_size
 
 
 class TimeUp(Exception):
@@ -48,8 +47,7 @@ class Kept:
 
     streams: names of all stages; each draws from a stream of its own, so that its numbers do not depend on which others have
     run.  count: of products and such, so far.  folder: None to keep nothing.  identity: all that the numbers depend on, as
-    text; what was kept under another one is not read.  deadline: by `monotonic`; a stage under way is then given up, one to
-    come is not begun.
+    text.  deadline: by `monotonic`; a stage under way is then given up, one to come is not begun.
 
     notes, counts: of all stages; unreached: stages that time did not reach.
     """
@@ -82,89 +80,64 @@ class Kept:
         ends_in_time: the work heeds the time left by itself; it is always done, and what it has at the deadline is returned but
         not kept.
         """
-        if (entry := self._read(name)) is not None:
-            with suppress(msgspec.ValidationError):
-                value = msgspec.msgpack.decode(entry.value, type=kind, dec_hook=_tensor)
-                self.stages.known(name, entry.seconds)
-                self._add(entry)
-                return value
-        try:
-            if not ends_in_time:
-                self._require_time()
-            value, entry = self._done(name, work, ends_in_time)
-        except TimeUp:
-            self.unreached.append(name)
-            self.stages.plan.pop(name, None)
-            return None
-        if not (ends_in_time and self.left == 0):
-            self._write(name, entry)
-        self._add(entry)
+        if (found := self._read(name, kind)) is not None:
+            self.stages.known(name, found[1].seconds)
+        else:
+            try:
+                found = self._done(name, work, ends_in_time)
+            except TimeUp:
+                self.unreached.append(name)
+                return None
+            if self.folder is not None and not (ends_in_time and self.left == 0):
+                self.folder.mkdir(parents=True, exist_ok=True)
+                content = msgspec.msgpack.encode(found[1])
+                write_atomically(_file(self.folder, name), self._digest(content) + content)
+        value, entry = found
+        self.notes += entry.notes
+        self.counts = [sum(both) for both in zip(self.counts or [0] * len(entry.counts), entry.counts, strict=True)]
         return value
 
-    def has(self, name: str) -> bool:
-        """Whether a stage's result is there from before."""
-        return self._read(name) is not None
-
-    def remove(self) -> None:
-        """Remove the folder."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
-
     def _done(self, name: str, work: Task[T], ends_in_time: bool) -> tuple[T, Entry]:
-        """What the work finds, as it is and as it is kept."""
+        """What the work finds, as it is and as it is kept.  TimeUp at the deadline."""
         notes, before = [], self.count()
-        with self.stages.stage(name) as report:
-            value = work(self.streams[name], report if ends_in_time else self._timed(report), notes)
-        counts = [after - first for after, first in zip(self.count(), before, strict=True)]
-        content = msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_plain))
-        return value, Entry(content, notes, counts, self.stages.timing[name])
-
-    def _timed(self, report: Progress) -> Progress:
-        """The same, and raises TimeUp at the deadline."""
 
         def timed(done: int, most: int, state: str) -> None:
             report(done, most, state)
             self._require_time()
 
-        return timed
+        if not ends_in_time:
+            self._require_time()
+        with self.stages.stage(name) as report:
+            value = work(self.streams[name], report if ends_in_time else timed, notes)
+        counts = [after - first for after, first in zip(self.count(), before, strict=True)]
+        content = msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_plain))
+        return value, Entry(content, notes, counts, self.stages.timing[name])
 
     def _require_time(self) -> None:
         if self.left == 0:
             raise TimeUp
 
-    def _add(self, entry: Entry) -> None:
-        self.notes += entry.notes
-        self.counts = [sum(both) for both in zip(self.counts or [0] * len(entry.counts), entry.counts, strict=True)]
-
-    def _read(self, name: str) -> Entry | None:
-        """What a stage found; None where nothing is kept, or it is damaged or another command's: it is then measured again."""
-        if self.folder is None:
-            return None
-        with suppress(OSError, msgspec.DecodeError):
-            kept = self._file(name).read_bytes()
-            if kept.startswith(self._key(content := kept[DIGEST:])):
-                return msgspec.msgpack.decode(content, type=Entry)
+    def _read(self, name: str, kind: type[T]) -> tuple[T, Entry] | None:
+        """What a stage found; None where nothing that can be read and is this command's is kept."""
+        if self.folder is not None and (file := _file(self.folder, name)).is_file():
+            with suppress(OSError, msgspec.DecodeError):
+                content = (kept := file.read_bytes())[DIGEST:]
+                if kept[:DIGEST] == self._digest(content):
+                    entry = msgspec.msgpack.decode(content, type=Entry)
+                    return msgspec.msgpack.decode(entry.value, type=kind, dec_hook=_tensor), entry
         return None
 
-    def _write(self, name: str, entry: Entry) -> None:
-        if self.folder is None:
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        content = msgspec.msgpack.encode(entry)
-        write_atomically(self._file(name), self._key(content) + content)
-
-    def _key(self, content: bytes) -> bytes:
-        """Digest of the command and of the content, with which a file begins: it shows that both are the same and whole."""
-        return hashlib.sha256(self.identity + b"\0" + content).digest()
-
-    def _file(self, name: str) -> Path:
-        assert self.folder is not None
-        return self.folder / f"{name.replace(' ', '-')}.msgpack"
+    def _digest(self, content: bytes) -> bytes:
+        return sha256(self.identity + b"\0" + content).digest()
 
 
 def kept_stages(folder: Path) -> list[str]:
     """The stages that are kept in a folder."""
     return sorted(file.stem.replace("-", " ") for file in folder.glob("*.msgpack"))
+
+
+def _file(folder: Path, name: str) -> Path:
+    return folder / f"{name.replace(' ', '-')}.msgpack"
 
 
 def _plain(value: Any) -> Any:

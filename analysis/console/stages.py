@@ -1,13 +1,12 @@
-"""Long work in named stages: a line for each with the time it took, how far it is, at which rate, and the time left for all.
+"""Long work in named stages: a line for each with the time it took, how far it is, and at which rate.
 
 Off a terminal there are no bars: a line when a stage ends, and one now and then while it runs.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from time import perf_counter
 from types import TracebackType
-from typing import NamedTuple
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -19,16 +18,6 @@ from landscape.results import Progress as Report
 
 Stage = Callable[[str], AbstractContextManager[Report]]
 NOW_AND_THEN = 15.0  # seconds between lines off a terminal
-LONGER = 0.25  # of what a stage has taken, which it takes at least still: one may take more than it was expected to
-SETTLED = 1.0  # seconds after which the rate of a stage is believed
-STRAYS = 4.0  # by which the time of a unit may be wrong
-
-
-class Work(NamedTuple):
-    """Expected work of a stage.  seconds: in all; units: of its progress, 0 where these take unlike times."""
-
-    seconds: float
-    units: float = 0.0
 
 
 def pace(done: int, seconds: float) -> str:
@@ -45,16 +34,13 @@ def pace(done: int, seconds: float) -> str:
 class Stages:
     """A context manager; `stage(name)` is one too, and gives what the estimators call with their progress.
 
-    Without a console nothing is printed.  timing: seconds a stage, in the order run; plan: what stages to come are expected to
-    take.
+    Without a console nothing is printed.  timing: seconds a stage, in the order run.
     """
 
     def __init__(self, console: Console | None = None) -> None:
         self.timing: dict[str, float] = {}
-        self.plan: dict[str, Work] = {}
-        self._slower = 1.0  # the last rate seen, as time for a unit over that of the plan
         bars = console is not None and console.is_terminal
-        self._whole, self._console = console, None if bars or console is None or console.quiet else console
+        self._console = None if bars or console is None or console.quiet else console
         self._said = perf_counter()
         self._progress = Progress(
             SpinnerColumn(finished_text="✓"),
@@ -92,7 +78,7 @@ class Stages:
         def report(done: int, most: int, state: str) -> None:
             look()
             spent = perf_counter() - start
-            words = f"{done} of at most {most}{pace(done, spent)}{self.left(name, spent, done)}"
+            words = f"{done} of at most {most}{pace(done, spent)}"
             self._progress.update(task, completed=done, total=most, state=f"{words}; {state}")
             if perf_counter() - self._said > NOW_AND_THEN:
                 self._say(f"{name}: {words}")
@@ -101,42 +87,13 @@ class Stages:
         self.timing[name] = perf_counter() - start
         done = self._progress.tasks[task].completed or 1  # an estimator that is done early has used less than the most
         self._progress.update(task, completed=done, total=done)
-        left = self.left()
-        self._say(f"{name}: {self.timing[name]:.1f} s{left}")
+        self._say(f"{name}: {self.timing[name]:.1f} s")
 
     def known(self, name: str, seconds: float) -> None:
         """Show a stage as done whose result an earlier run has kept; seconds: that it took then."""
         self.timing[name] = seconds
         self._progress.update(self._progress.add_task(name, total=1, state="kept from before"), completed=1)
         self._say(f"{name}: kept from before")
-
-    def left(self, name: str = "", spent: float = 0.0, done: float = 0.0) -> str:
-        """Time left for all stages in words; empty for a stage without a plan.
-
-        name, spent, done: of the stage under way, with its seconds and units so far.  It is taken to go on at that rate, and
-        those to come to be slower than planned by as much as it is.
-        """
-        if name and name not in self.plan:
-            return ""
-        to_come = sum(work.seconds for each, work in self.plan.items() if each not in self.timing and each != name)
-        own = 0.0
-        if name:
-            work = self.plan[name]
-            rest = work.seconds * self._slower - spent
-            if done and work.units and spent > SETTLED:
-                slower = spent / done * work.units / work.seconds
-                self._slower = min(max(slower, 1 / STRAYS), STRAYS)
-                rest = (work.units - done) * spent / done
-            own = max(rest, LONGER * spent)
-        seconds = own + self._slower * to_come
-        return f", about {max(seconds, 1.0):.0f} s left" if seconds else ""
-
-    def expect(self, plan: Mapping[str, Work], because: str) -> None:
-        """Say how long stages to come will take, and why."""
-        self.plan = dict(plan)
-        if self._whole is not None:
-            seconds = sum(work.seconds for work in plan.values())
-            self._whole.print(f"about {max(seconds, 1.0):.0f} s from here: {because}", highlight=False, soft_wrap=True)
 
     def _say(self, words: str) -> None:
         self._said = perf_counter()

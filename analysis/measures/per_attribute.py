@@ -74,14 +74,9 @@ class PerAttributeOptions:
             )
 
     @property
-    def expected(self) -> dict[str, tuple[int, float, float]]:
-        """Expected work of every stage: units of its progress, products with a batch of vectors, and renders."""
-        scenes: dict[SceneName, float] = {"trained": 1.0, "split": SPLIT} if self.split_control else {"trained": 1.0}
-        return {
-            _stage_of(scene, operator): (PARTS, PARTS * PRODUCTS * more, 0)
-            for scene, more in scenes.items()
-            for operator in OPERATORS
-        }
+    def products(self) -> float:
+        """Expected number of products with a batch of vectors, of the cost of those of the trained scene."""
+        return len(OPERATORS) * PARTS * PRODUCTS * (1 + SPLIT * self.split_control)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +177,7 @@ def measure_per_attribute(
     }
     rows: list[FamilyRow] = []
     for (scene, operator), stream in streams.items():
-        with stage(_stage_of(scene, operator)) as report:
+        with stage(f"per attribute: {operator}{', split' if scene == 'split' else ''}") as report:
             hessian = SceneHessian(scenes[scene], gauss_newton=OPERATORS[operator])
             D = scale(scenes[scene])
             known = ends if scene == "trained" and operator == "hessian" and D is None else None
@@ -190,10 +185,6 @@ def measure_per_attribute(
             count = len(scenes[scene].active)
             rows += [FamilyRow(scene, operator, block, count, dim, found) for block, dim, found in measured]
     return FamilyFindings(tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)), options.metric, unit)
-
-
-def _stage_of(scene: SceneName, operator: schema.Operator) -> str:
-    return f"per attribute: {operator}{', split' if scene == 'split' else ''}"
 
 
 def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:

@@ -28,7 +28,7 @@ from analysis.measures.memory import expected_peak, require_pictures, size_of, t
 from analysis.measures.units import step_lengths
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
-from analysis.probe.plan import Expected, expected_seconds, seconds_of_render
+from analysis.probe.plan import expected_seconds, seconds_of_render
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import guess, remarks, steps_made, summary
@@ -86,10 +86,9 @@ def _run(
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
-    after = {} if families is None else families.expected
     guessed = guess(checkpoint.origin)
     say(*guessed, _introduction(scene, checkpoint, objective), console=console)
-    say(_expected(objective, settings, after), console=console)
+    say(_expected(objective, settings, 0.0 if families is None else families.products), console=console)
     made = asked(options, checkpoint)
     identity = f"{made.but('settings.per_attribute').digest} {device}"  # families are measured after what is kept
     # the folder is opened first, so that one that cannot be written is refused before anything is measured
@@ -103,7 +102,7 @@ def _run(
         lengths = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
         found = measure(
             objective, settings, lengths, generator, stages, None if ranks else unfinished, identity,
-            deadline=begun + limit - DRAWING, population=checkpoint.all_views, after=after,
+            deadline=begun + limit - DRAWING, population=checkpoint.all_views,
         )  # fmt: skip
         origin = provenance_of(made, options.checkpoint, command, checkpoint, scene)
         data, arrays = probe_record(found, objective, origin, stages.timing), probe_arrays(found)
@@ -247,11 +246,11 @@ def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjectiv
     )
 
 
-def _expected(objective: SceneObjective, settings: ProbeSettings, after: Expected) -> str:
+def _expected(objective: SceneObjective, settings: ProbeSettings, further: float) -> str:
     """Expected time and memory, from a render and from the views' sizes.  Raises MemoryError where it cannot fit."""
     peak = expected_peak(objective)
     objective.loss(objective.active.flat)  # untimed, as the kernels may compile
-    seconds = expected_seconds(settings, seconds_of_render(objective), after)
+    seconds = expected_seconds(settings, seconds_of_render(objective), further)
     return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
 
 

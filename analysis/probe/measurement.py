@@ -39,7 +39,7 @@ from analysis.measures.localization import mass_shares
 from analysis.measures.memory import basis_within, vectors_within
 from analysis.measures.steepest import heaviest
 from analysis.probe.measured import LeftOut, Measured, PlaneSlice, Rendered, Spectrum
-from analysis.probe.plan import MOST_AT_ONCE, NOTHING, Expected, plan_of, seconds_of_product, seconds_of_render
+from analysis.probe.plan import MOST_AT_ONCE
 from analysis.probe.settings import FEWEST_STEPS, ProbeSettings
 from analysis.records.schema import Depth
 from landscape import (
@@ -88,10 +88,8 @@ LEFT_OUT = {  # notes on stages that the settings exclude
     "finite probe": "the finite probe was left out",
     "depth": "positions along and across the rays were left out",
 }
-RISE, MOST_DOUBLINGS = (
-    0.01,
-    7,
-)  # longest step of renders along the ends: change of the loss, and from the optimiser's step
+# longest step of renders along the ends: change of the loss, and from the optimiser's step
+RISE, MOST_DOUBLINGS = 0.01, 7
 FEW_POINTS = 8  # renders that tell the noise of one
 MOST_SAMPLES = 64  # of a trace on a CPU: more would take longer than summing the exact blocks
 
@@ -106,12 +104,11 @@ def measure(
     identity: str = "",
     deadline: float = inf,
     population: int | None = None,
-    after: Expected = NOTHING,
 ) -> Measured:
     """Run every stage.
 
     lengths: of the optimiser's first step in a parameter, by attribute.  folder, identity, deadline: see `Kept`.  population:
-    number of training views, where the objective has fewer.  after: stages that the caller runs afterwards.
+    number of training views, where the objective has fewer.
     """
     with stages.stage("linearise") as report:
         at = _linearised(objective, settings, report)
@@ -119,11 +116,7 @@ def measure(
         operator_check = check_operator(at.operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(at.hessian, spawn(generator), report, settings.checked_views)
     of_checks = at.work()
-    product, render = seconds_of_product(at.hessian), seconds_of_render(objective)
-    words = f"{MOST_AT_ONCE} products at once take {product:.2g} s, a render of all views {render:.2g} s"
     kept = Kept(stages, generator, STAGES, at.work, folder, identity, deadline)
-    plan = plan_of(settings, product, render, after)
-    stages.expect({name: work for name, work in plan.items() if not kept.has(name)}, words)
     return _all_stages(at, lengths, kept, operator_check, gradient_check, of_checks, population)
 
 
@@ -157,7 +150,7 @@ def _linearised(objective: SceneObjective, settings: ProbeSettings, report: Prog
 
 
 def _compile_blocks(objective: SceneObjective) -> None:
-    """Compile the kernel of exact blocks, on one Gaussian, so that the stages that use it take the expected time."""
+    """Compile the kernel of exact blocks, on one Gaussian, so that the stages that use it are not timed with that."""
     if objective.couples_pixels and backend_of(objective.active.flat).exact_blocks:
         one = objective.active.select(torch.zeros(1, dtype=torch.int64))
         objective.linearizer(one)(0).block_diagonals(approximate=False, parts=(False, True))

@@ -11,6 +11,7 @@ Gaussians that no training view sees go first.  What --curve has measured is kep
 """
 
 import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -91,7 +92,7 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
         (folder / RECORD).write_text(json_text(plain(origin)), encoding="utf-8")
         notes = draw_or_say("uses", folder) if curve is not None else []
         result = _scored(training.gaussians, objective, held_out)
-    kept.remove()
+    shutil.rmtree(unfinished, ignore_errors=True)
     _conclude(ranks, curve, training.gaussians, result, out)
     say(*notes, style="yellow", console=console)
     return 0

@@ -142,12 +142,6 @@ def of_split(objective: SceneObjective, checkpoint: Checkpoint) -> SceneObjectiv
     )
 
 
-def test_every_stage_of_the_families_has_an_expected_time(record):
-    ran = [name for name in record.data.timing if name.startswith("per_attribute")]
-    assert list(PerAttributeOptions(split_control=True).expected) == ran
-    assert list(PerAttributeOptions().expected) == [name for name in ran if "split" not in name]
-
-
 @pytest.mark.parametrize("operator", ["hessian", "gauss-newton"])
 def test_every_family_is_that_of_the_dense_block_in_the_metrics_units(split, objective, checkpoint, operator):
     held, resolved = [], 0

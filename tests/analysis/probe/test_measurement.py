@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from analysis.console.stages import Stages, Work
+from analysis.console.stages import Stages
+from analysis.measures.per_attribute import PerAttributeOptions
 from analysis.measures.units import step_lengths
 from analysis.probe import measurement
 from analysis.probe.measurement import measure
-from analysis.probe.plan import plan_of
+from analysis.probe.plan import expected_seconds
 from analysis.probe.settings import ProbeSettings
 from landscape import EigenSettings, TraceSettings, extreme_eigenpairs
 from landscape.eigen.power import power_iteration
@@ -27,8 +28,8 @@ from tests.splat.random_scenes import random_gaussians
 LENGTHS = step_lengths(LearningRates(), 1.0)
 
 
-def test_kernels_are_compiled_before_the_time_is_told_and_blocks_made_once(monkeypatch):
-    """What the probe will take is told after the first product, render, block and float64 gradient."""
+def test_kernels_are_compiled_before_the_stages_that_are_kept_and_blocks_made_once(monkeypatch):
+    """The seconds of these stages are those of the work alone."""
     calls: list[str] = []
 
     def counted(owner, name):
@@ -45,11 +46,11 @@ def test_kernels_are_compiled_before_the_time_is_told_and_blocks_made_once(monke
         counted(SceneObjective, name)
     counted(LinearizedView, "block_diagonals")
     counted(measurement, "check_against_gradient")
-    counted(measurement, "plan_of")
+    counted(measurement, "Kept")
     objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
     settings = replace(ProbeSettings.quick(), slice_points=5, block_ssim_window=True)
     found = measure(objective, settings, LENGTHS, torch.Generator().manual_seed(0), Stages())
-    first = calls[: calls.index("plan_of")]
+    first = calls[: calls.index("Kept")]
     assert {"block_diagonal", "evaluate", "exact", "check_against_gradient"} <= {*first}
     assert calls.count("block_diagonal") == 1 and calls.count("gauss_newton") == 1
     assert found.value == pytest.approx(objective.loss(objective.active.flat))
@@ -120,13 +121,10 @@ def test_the_paper_s_power_iteration_is_read_from_the_density_without_products()
 
 
 def test_a_quick_probe_is_expected_to_take_what_it_makes_alone():
-    whole, quick = (plan_of(settings, 1.0, 10.0) for settings in (ProbeSettings(), ProbeSettings.quick()))
-    assert set(whole) - set(quick) == {"density", "finite probe", "depth"}
-    assert quick["slice"].units == 2 * 21 < whole["slice"].units
-    assert (
-        quick["slice"].seconds == pytest.approx(1.5 * 21 * 10.0) and quick["traces"].seconds < whole["traces"].seconds
-    )
-    assert plan_of(ProbeSettings(), 2.0, 10.0, {"per_attribute": (6, 100, 1)})["per_attribute"] == Work(210.0, 6)
+    whole, quick = ProbeSettings(), ProbeSettings.quick()
+    seconds = [expected_seconds(settings, 2.0) for settings in (quick, replace(quick, slice_points=41), whole)]
+    assert seconds[1] - seconds[0] == pytest.approx(1.5 * 20 * 2.0) and seconds[2] > 2 * seconds[1]
+    assert expected_seconds(quick, 2.0, PerAttributeOptions().products) - seconds[0] == pytest.approx(4.5 * 2 * 6 * 26 * 2.0)
 
 
 def test_traces_that_samples_do_not_resolve_are_exact():
