@@ -17,13 +17,16 @@ import subprocess
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from threading import Event
 from time import monotonic
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Column
 
 from analysis.console.drawing import own_python
 from analysis.console.interruption import interruption
@@ -35,13 +38,14 @@ from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS, read_scores
 from analysis.runs.options import SweepOptions
 from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
-from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import PROBE, of_other_threads, summarize, tables, unfinished, write_results
 from analysis.train.command import planned, resumed
+from analysis.train.training_time import TrainingTime
 from landscape.errors import InputError
 from splat.model.untrusted import Taken, locked
 from splat.training.checkpoint import Checkpoint
 
+Stage = Literal["train", "probe"]
 CELL_FAILED = 1
 CELLS_ELSEWHERE = 75  # sysexits.h's EX_TEMPFAIL: the same command later finds them done
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -116,7 +120,17 @@ class _Cells:
         self.failed: dict[str, str] = {}
         self.elsewhere: list[Cell] = []
         self.running: dict[str, subprocess.Popen[Any]] = {}
-        self.progress = SweepProgress(sweep, to_do, jobs)
+        self.active: dict[str, Stage] = {}
+        self.console, self.start, self.steps = Console(stderr=True), monotonic(), self._steps()
+        self.bar = Progress(
+            TextColumn("sweep", table_column=Column(no_wrap=True)),
+            BarColumn(bar_width=20, table_column=Column(min_width=10)),
+            TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)),
+            console=self.console,
+            refresh_per_second=2,
+            expand=True,
+        )
+        self.task = self.bar.add_task("", total=sum(cell.steps for cell in sweep.cells))
 
     @property
     def statuses(self) -> dict[str, str]:
@@ -132,26 +146,44 @@ class _Cells:
         """The tables of all cells, those too that are not asked for."""
         return write_results(self.whole, self.statuses)
 
+    def _steps(self) -> int:
+        """Steps of all trainings until their last checkpoints."""
+        return sum(TrainingTime.read(cell.out).step for cell in self.sweep.cells)
+
+    def left(self, steps: int) -> str:
+        """The time left, at the pace of the steps that this sweep has made; that of probes is not counted."""
+        made, rest = steps - self.steps, sum(cell.steps for cell in self.sweep.cells) - steps
+        return str(timedelta(seconds=round((monotonic() - self.start) / made * rest))) if made else "--"
+
     def run(self) -> None:
         """All that is missing, so many cells at once, until it is done or Ctrl-C stopped it."""
         self.write()  # a file that is damaged is refused before hours are spent
         told: set[int] = set()
         cells = [cell for cell in self.sweep.cells if self.to_do[cell.name]]
-        with ThreadPoolExecutor(self.jobs) as pool, self.progress:
+        with ThreadPoolExecutor(self.jobs) as pool, self.bar:
             pending = {pool.submit(self._cell, cell) for cell in cells}
             try:
                 while pending:
                     done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
+                    steps = self._steps()
                     for future in done:
-                        self.progress.ended(future.result(), self.statuses)
-                        self.write()
-                    self.progress.update()
+                        self._ended(future.result(), steps)
+                    under_way = ", ".join(f"{name} {stage}" for name, stage in self.active.items())
+                    self.bar.update(self.task, completed=steps, description=f"{self.left(steps)} left: {under_way}")
                     if self.interrupted.is_set():
                         self._tell(told)
             except BaseException:
                 self.interrupted.set()
                 self._tell(set())
                 raise
+
+    def _ended(self, cell: Cell, steps: int) -> None:
+        """Write the tables, and say how a cell ended that has begun, and how much is left."""
+        self.write()
+        if self.active.pop(cell.name, None) is not None:
+            count = sum(status == "done" for status in self.statuses.values())
+            words = f"{self.statuses[cell.name]}; {count} of {len(self.statuses)} cells, {self.left(steps)} left"
+            say(f"{cell.name}: {words}", console=self.console)
 
     def _tell(self, told: set[int]) -> None:
         """Ask every command that has not been told yet to save and end; told twice it would not save.
@@ -177,12 +209,10 @@ class _Cells:
 
     def _stages(self, cell: Cell, lock: int) -> None:
         while self.to_do[cell.name] and not self.interrupted.is_set():
-            stage, start = self.to_do[cell.name][0], monotonic()
-            self.progress.started(cell, stage)
+            stage = self.active[cell.name] = self.to_do[cell.name][0]
             code = self._command(cell, stage, lock)
             if code == 0:
                 self.to_do[cell.name].pop(0)
-                self.progress.took(stage, monotonic() - start)
             elif not self.interrupted.is_set():
                 self.failed[cell.name] = f"{cell.name}: {stage} ended with exit code {code}; see {log_of(cell)}"
                 break

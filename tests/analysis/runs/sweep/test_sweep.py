@@ -11,6 +11,7 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import pandas as pd
 import pytest
@@ -20,8 +21,7 @@ import tyro
 from analysis.commands.cli import main
 from analysis.records.provenance import usable_cores
 from analysis.runs.sweep.sweep import CELLS_ELSEWHERE, _Cells, lock_of, missing, only, probe_arguments
-from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
-from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
+from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_results import results
 from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
@@ -365,34 +365,10 @@ def test_the_results_are_the_runs_own_metrics(finished, folder):
     assert rows["threads"].tolist() == pytest.approx([began, share], nan_ok=True)
 
 
-def test_the_time_left_follows_the_pace_of_each_method(folder, tmp_path):
+def test_the_time_left_is_told_at_the_pace_of_the_steps_so_far(folder, tmp_path, monkeypatch):
+    """Two of four trainings of 12 steps, one of which was there before."""
     sweep = read_sweep(folder / "sweep.toml", tmp_path)
-    progress = SweepProgress(sweep, {cell.name: ["train"] for cell in sweep.cells}, jobs=2)
-    assert progress.seconds([TrainingTime()] * 4) is None
-    known = [TrainingTime(step=12, wall=6.0), TrainingTime(step=4, wall=8.0), TrainingTime(), TrainingTime()]
-    assert progress.seconds(known) == pytest.approx((8 * 2 + 12 * 0.5 + 12 * 2) / 2)
-    assert progress.seconds([TrainingTime(step=12, wall=6.0)] + [TrainingTime()] * 3) == pytest.approx(3 * 12 * 0.5 / 2)
-
-
-def test_the_time_left_of_an_unknown_method_is_that_of_a_whole_run(folder, tmp_path):
-    sweep = read_sweep(folder / "sweep.toml", tmp_path)
-    slow, fast = (
-        Cell("a", name, replace(sweep.cells[0].training, iterations=steps))
-        for name, steps in (("slow", 3), ("fast", 3000))
-    )
-    cells = (slow, fast, replace(slow, scene="b"), replace(fast, method="new"))
-    progress = SweepProgress(replace(sweep, cells=cells), {cell.name: ["train"] for cell in cells}, jobs=1)
-    spent = [TrainingTime(step=3, wall=6.0), TrainingTime(step=3000, wall=2.0), TrainingTime(), TrainingTime()]
-    assert progress.seconds(spent) == pytest.approx(6 + 4)
-
-
-def test_the_time_left_goes_with_the_last_probe(folder, tmp_path, monkeypatch):
-    sweep = read_sweep(folder / "sweep.toml", tmp_path)
-    to_do: dict[str, list[Stage]] = {cell.name: ["probe"] for cell in sweep.cells}
-    progress = SweepProgress(sweep, to_do, jobs=1)
-    monkeypatch.setattr(TrainingTime, "read", lambda run: TrainingTime(step=12, wall=6.0))
-    progress.took("probe", 60.0)
-    assert progress.left() == "0:04:00"
-    for stages in to_do.values():
-        stages.pop()
-    assert progress.left() == "0:00:00"
+    monkeypatch.setattr(TrainingTime, "read", lambda run: TrainingTime(step=12 * (run == sweep.cells[0].out)))
+    cells = _Cells(sweep, {cell.name: [] for cell in sweep.cells}, 1, Event(), sweep)
+    monkeypatch.setattr("analysis.runs.sweep.sweep.monotonic", lambda: cells.start + 60)
+    assert cells.left(12) == "--" and cells.left(24) == "0:02:00"
