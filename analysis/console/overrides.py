@@ -8,7 +8,7 @@ VALUE   a plain value, or text that is read by the setting's type: a number, tru
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
-from difflib import SequenceMatcher
+from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -51,31 +51,12 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
 
 
 def _unknown(key: str, config: TrainConfig) -> str:
-    """Sentence for a key that is no setting: with the one that was meant, of whatever method, else with the nearest."""
-    common, own, method = _names(config), _names(config.method), config.method.name
-    words = f"expected a setting of the training or of the method {method}, got {key!r}"
-    if key in LABELS:
-        return f"{words}, which is an option of its own"
-    others = {name: _names(kind()) for name, kind in METHODS.items()}
+    """Sentence for a key that is no setting: with the method that has it, or the setting that was meant."""
+    names, others = [*_names(config), *_names(config.method)], {name: _names(kind()) for name, kind in METHODS.items()}
+    words = f"expected a setting of the training or of the method {config.method.name}, got {key!r}"
     if of := [name for name, settings in others.items() if key in settings]:
         return f"{words}, which is one of --method {' and '.join(of)}"
-    if meant := did_you_mean(key, [*common, *own]):
-        return words + meant
-    for name, settings in others.items():
-        if meant := did_you_mean(key, settings):
-            return f"{words}{meant.removesuffix('?')} of the method {name}?"
-    if meant := did_you_mean(key, METHODS):
-        return words + meant.replace("mean ", "mean --method ")
-    return f"{words}; the nearest are {', '.join(_nearest(key, [*common, *own]))}"
-
-
-def _nearest(key: str, names: Sequence[str]) -> list[str]:
-    """Three names of settings, by the likeness of the last part or of the whole."""
-
-    def likeness(name: str) -> float:
-        return max(SequenceMatcher(None, key, part).ratio() for part in (name, name.rpartition(".")[2]))
-
-    return sorted(names, key=likeness, reverse=True)[:3]
+    return words + (did_you_mean(key, names) or f"; the nearest are {', '.join(get_close_matches(key, names, 3, 0.0))}")
 
 
 def _names(settings: TrainConfig | MethodSettings) -> list[str]:

@@ -1,23 +1,20 @@
-"""Limits by memory: how many vectors fit; and, where it ran out, what a probe or a slice takes and what would fit."""
+"""Limits by memory: how many vectors fit; and, before anything is measured, whether a probe or a slice does."""
 
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from math import ceil, sqrt
+from collections.abc import Sequence
+from math import ceil
 
 import torch
 
 from landscape import EigenSettings
-from landscape.errors import InputError, TooLittleMemory, lacks_memory
+from landscape.errors import InputError, TooLittleMemory
 from splat.backend.memory import SLACK, free_memory, is_told, resident_memory
-from splat.curvature.linearize import VECTORS, KeptViews
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
 from splat.scenes.view import Frame
 
-MIB, GIB = 2**20, 2**30
+GIB = 2**30
 PICTURES, COPIES = 12, 4  # planes of a view, its loss's included; copies of the Gaussians
-FEWEST = 12  # vectors: four start vectors of a product, what it makes of them and a small basis
 
 
 def vectors_within(objective: SceneObjective, memory: float) -> int:
@@ -93,35 +90,3 @@ def _size(size: float) -> str:
     """
     unit, name = next(((each, name) for each, name in ((1e9, "GB"), (1e6, "MB")) if size >= 0.9995 * each), (1e3, "kB"))
     return f"{size / unit:.3g} {name}"
-
-
-@contextmanager
-def telling_needs(objective: SceneObjective) -> Iterator[None]:
-    """Make a MemoryError say what products with the Hessian take, what was free, and what would fit."""
-    free = free_memory(objective.active.flat.device)
-    try:
-        yield
-    except Exception as error:
-        if not lacks_memory(error) or isinstance(error, TooLittleMemory):
-            raise
-        raise MemoryError(_needs(objective, vars(objective).get("linearized"), free)) from error
-
-
-def _needs(objective: SceneObjective, kept: KeptViews | None, free: int) -> str:
-    """kept: None where not even the first view could be linearised."""
-    camera, flat = objective.views[0].camera, objective.active.flat
-    pictures = f"a view of {camera.width} x {camera.height} px with {len(objective.active):,} Gaussians in sight"
-    if kept is None:
-        return f"{pictures} takes more than the {free / MIB:,.0f} MiB that were free"
-    vectors = FEWEST * flat.nbytes
-    pixels = kept.first.bytes + kept.workspace(VECTORS)
-    said = (
-        f"products of {pictures} take {pixels / MIB:,.0f} MiB, {FEWEST} vectors of {flat.numel():,} parameters "
-        f"{vectors / MIB:,.0f} MiB, and {free / MIB:,.0f} MiB were free; "
-    )
-    if vectors > free / 2:
-        return said + f"about {int(len(objective.active) * free / 2 / vectors):,} Gaussians would fit"
-    factor = max(2, ceil(sqrt(2 * pixels / free)))
-    return (
-        said + f"pictures of {camera.width // factor} x {camera.height // factor} px would fit (--downscale {factor})"
-    )

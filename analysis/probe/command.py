@@ -24,7 +24,7 @@ from analysis.console.options import ForeignOptions
 from analysis.console.plain import say
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.measures.memory import expected_peak, require_pictures, size_of, telling_needs
+from analysis.measures.memory import expected_peak, require_pictures, size_of
 from analysis.measures.units import step_lengths
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
@@ -92,12 +92,7 @@ def _run(
     made = asked(options, checkpoint)
     identity = f"{made.but('settings.per_attribute').digest} {device}"  # families are measured after what is kept
     # the folder is opened first, so that one that cannot be written is refused before anything is measured
-    with (
-        record_folder(out) if writes else nullcontext() as folder,
-        stages,
-        _kept(unfinished, command, console),
-        telling_needs(objective),
-    ):
+    with record_folder(out) if writes else nullcontext() as folder, stages, _kept(unfinished, command, console):
         generator = torch.Generator(device).manual_seed(options.seed)
         lengths = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
         found = measure(

@@ -63,14 +63,18 @@ class ViewScores(Struct, kw_only=True):
     views: dict[str, "ViewScores"] = {}
 
 
-class Clock(Struct, kw_only=True):
-    """Seconds by the clock and of all processors together; threads that a kernel might use, None where that changed; peak:
-    the most bytes of memory that the process held."""
+class Seconds(Struct):
+    """Time that the steps of a training took until its last checkpoint, at `step`.
 
-    wall: Number = None
-    cpu: Number = None
-    threads: Number = None
-    peak: Number = None
+    wall, cpu: seconds by the clock, and of all processors together.  threads: that a kernel might use, None where a resume
+    changed them.  peak: the most bytes of memory that the process held, loading too (of a GPU's none).
+    """
+
+    step: Count
+    wall: float
+    cpu: float
+    threads: int | None = None
+    peak: int | None = None
 
 
 class Made(Struct, kw_only=True):
@@ -88,18 +92,8 @@ class Scores(Struct, kw_only=True):
     gaussians: Count
     train: ViewScores | None = None
     test: ViewScores | None = None
-    seconds: Clock | None = None
+    seconds: Seconds | None = None
     provenance: Made | None = None
-
-
-class Seconds(Struct, kw_only=True):
-    """Seconds that the steps of a training took until its last checkpoint, at `step`; fields as in `Clock`."""
-
-    step: Count
-    wall: float
-    cpu: float
-    threads: int | None = None
-    peak: int | None = None
 
 
 class Comparison(Struct, kw_only=True):
@@ -237,11 +231,6 @@ class MapRecord(Struct, kw_only=True):
 def read_scores(run: Path) -> Scores:
     remedy = "remove it and repeat the training's command with --resume, which scores again"
     return read_json(run / METRICS, Scores, "the scores of landscape train", remedy)
-
-
-def read_seconds(run: Path) -> Seconds:
-    remedy = "remove it: nothing but the time until its last checkpoint is lost"
-    return read_json(run / SECONDS, Seconds, "the seconds of a training", remedy)
 
 
 def read_map(folder: Path) -> MapRecord:

@@ -16,7 +16,7 @@ from rich.table import Table
 from analysis.records.findings import attribute_name
 from analysis.records.quantities import PLACES, SCORES, measured, quantity
 from analysis.records.records import ProbeRecord
-from analysis.records.run_files import ENDS, Clock, Scores
+from analysis.records.run_files import ENDS, Scores
 from analysis.records.schema import INDICES, Anisotropy, Depth, Effect, End, Index, Operator, Trace
 from analysis.records.tables import OPERATOR_NAMES, Cell, bracketed, factor
 from splat.model.typed import leaves
@@ -67,13 +67,13 @@ def comparison(runs: Sequence[Run]) -> list[Row]:
 
 def _about(runs: Sequence[Run]) -> Iterable[Row]:
     configs = [run.checkpoint.training.config for run in runs]
-    clocks = [(run.scores and run.scores.seconds) or Clock() for run in runs]
+    clocks = [run.scores and run.scores.seconds for run in runs]
     yield Row("run", "method", tuple(_method(config.method) for config in configs))
     yield Row("run", "steps", tuple(_plain(run.checkpoint.training.step) for run in runs))
     yield Row("run", "Gaussians", tuple(_plain(run.data.counts.gaussians) for run in runs))
     yield Row("run", "in sight", tuple(_plain(run.data.counts.visible_gaussians) for run in runs))
-    yield Row("run", "seconds of training", tuple(_plain(clock.wall) for clock in clocks))
-    yield Row("run", "seconds of all processors", tuple(_plain(clock.cpu) for clock in clocks))
+    yield Row("run", "seconds of training", tuple(_plain(clock and clock.wall) for clock in clocks))
+    yield Row("run", "seconds of all processors", tuple(_plain(clock and clock.cpu) for clock in clocks))
 
 
 def _scores(runs: Sequence[Run]) -> Iterable[Row]:

@@ -28,7 +28,7 @@ from torch import Tensor
 from analysis.console.plain import say
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.measures.memory import expected_peak, size_of, telling_needs
+from analysis.measures.memory import expected_peak, size_of
 from analysis.probe.command import opened, scene_objective
 from analysis.probe.measurement import evaluation
 from analysis.probe.record import provenance_of
@@ -89,7 +89,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
         ends = [state_of(checkpoint.training.gaussians.with_flat(other), 0) for other in others]
         made = checkpoint.fingerprint(_asked(options, settings) | {"others": ends}, options.seed)
     # the folder is opened first, so that one that cannot be written is refused before anything is rendered
-    with record_folder(out, SliceRecord.FILE) as folder, stages, telling_needs(objective):
+    with record_folder(out, SliceRecord.FILE) as folder, stages:
         notes: list[str] = []
         kept = unfinished / made.but("settings", "seed").digest  # the points have a digest of their own
         known = _known(options.checkpoint.parent / "probe", kept, made, objective.active.flat.device, notes)

@@ -8,7 +8,6 @@ RUN/test/panels/NAME.png    side by side: photograph, render, and the error, whi
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import asdict
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from msgspec import structs
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -69,7 +69,7 @@ def report(training: Training, views: Sequence[View], held_out: Sequence[View], 
         "gaussians": len(training.gaussians),
         "train": _scores(seen),
         "test": _scores(tested) if tested else None,
-        "seconds": asdict(TrainingTime.read(out)),
+        "seconds": structs.asdict(TrainingTime.read(out)),
         "provenance": plain(provenance(config.seed, checkpoint=str(out / CHECKPOINT), fingerprint=made)),
     }
     write_atomically(out / METRICS, json_text(metrics).encode())

@@ -251,21 +251,20 @@ class RunFiles(Format):
             "masked": False,
             "views": {"a": {"psnr": 20.0, "ssim": 0.5}},
         }
-        clock = {"wall": 1.0, "cpu": 2.0, "threads": 2}
+        clock = {"step": 3, "wall": 1.0, "cpu": 2.0, "threads": 2}
         metrics = {"step": 3, "gaussians": 5, "train": scores, "test": scores, "seconds": clock}
         (self.root / "metrics.json").write_text(json.dumps(metrics))
-        (self.root / "seconds.json").write_text(json.dumps({"step": 3, **clock}))
+        (self.root / "seconds.json").write_text(json.dumps(clock))
         (self.root / "compare.json").write_text(json.dumps({"runs": {"a": "probe"}}))
 
     def broken(self) -> list[str]:
         return ["metrics.json", "seconds.json", "compare.json"]
 
     def use(self) -> None:
-        from analysis.records.run_files import read_comparison, read_scores, read_seconds
+        from analysis.records.run_files import read_comparison, read_scores
         from analysis.train.training_time import TrainingTime
 
         read_scores(self.root)
-        read_seconds(self.root)
         read_comparison(self.root)
         TrainingTime.read(self.root)
 

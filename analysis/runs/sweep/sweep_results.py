@@ -24,7 +24,7 @@ from rich.table import Table
 from analysis.records.findings import attribute_name, of_budgets
 from analysis.records.quantities import PLACES, PLUS_MINUS, SCORES, quantity
 from analysis.records.records import ProbeRecord, read_record
-from analysis.records.run_files import Clock, ViewScores, read_scores
+from analysis.records.run_files import ViewScores, read_scores
 from analysis.records.schema import INDICES, Effect, Index
 from analysis.runs.sweep.sweep_file import Cell, Sweep
 from splat.training.checkpoint import write_atomically
@@ -100,13 +100,8 @@ def metrics_of(run: Path) -> dict[str, float]:
             for key, value in structs.asdict(part or ViewScores()).items()
             if key != "views"
         }
-    clock = found.seconds or Clock()
-    seconds = {
-        "wall_seconds": _number(clock.wall),
-        "cpu_seconds": _number(clock.cpu),
-        "threads": clock.threads or math.nan,
-        "peak_memory": _number(clock.peak),
-    }
+    names = {"wall_seconds": "wall", "cpu_seconds": "cpu", "threads": "threads", "peak_memory": "peak"}
+    seconds = {column: _number(getattr(found.seconds, name, None)) for column, name in names.items()}
     return row | {"gaussians": found.gaussians} | seconds
 
 

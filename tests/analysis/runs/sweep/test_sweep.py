@@ -368,7 +368,7 @@ def test_the_results_are_the_runs_own_metrics(finished, folder):
 def test_the_time_left_is_told_at_the_pace_of_the_steps_so_far(folder, tmp_path, monkeypatch):
     """Two of four trainings of 12 steps, one of which was there before."""
     sweep = read_sweep(folder / "sweep.toml", tmp_path)
-    monkeypatch.setattr(TrainingTime, "read", lambda run: TrainingTime(step=12 * (run == sweep.cells[0].out)))
+    monkeypatch.setattr(TrainingTime, "read", lambda run: TrainingTime(12 * (run == sweep.cells[0].out), 0.0, 0.0))
     cells = _Cells(sweep, {cell.name: [] for cell in sweep.cells}, 1, Event(), sweep)
     monkeypatch.setattr("analysis.runs.sweep.sweep.monotonic", lambda: cells.start + 60)
     assert cells.left(12) == "--" and cells.left(24) == "0:02:00"

@@ -104,7 +104,7 @@ def test_times_by_the_clock_are_compared_only_at_as_many_threads():
 
 
 def test_a_training_continued_with_other_threads_has_none_of_its_own(monkeypatch):
-    spent = TrainingTime()
+    spent = TrainingTime(0, 0.0, 0.0)
     for threads, said in ((2, 2), (2, 2), (3, None), (3, None)):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         list(spent.timed([StepResult(spent.step + 1, 0.5, 9, "view")]))
@@ -112,11 +112,11 @@ def test_a_training_continued_with_other_threads_has_none_of_its_own(monkeypatch
 
 
 def test_peak_memory_is_kept_and_never_falls(tmp_path):
-    spent = TrainingTime()
+    spent = TrainingTime(0, 0.0, 0.0)
     spent.write(tmp_path)
     held = TrainingTime.read(tmp_path).peak
     assert held is not None and 2**26 < held < 2**40  # bytes of a process with torch, not their 1024th part
-    TrainingTime(peak=2**50).write(tmp_path)
+    TrainingTime(0, 0.0, 0.0, peak=2**50).write(tmp_path)
     assert TrainingTime.read(tmp_path).peak == 2**50
 
 
