@@ -61,7 +61,6 @@ from .spectrum.density import spectral_density as spectral_density
 from .spectrum.monitor import Monitor as Monitor
 from .spectrum.rules import SpectralDensity as SpectralDensity
 from .traces.diagonal import DiagonalEstimate as DiagonalEstimate
-from .traces.diagonal import GroupSums as GroupSums
 from .traces.diagonal import estimate_diagonal as estimate_diagonal
 from .traces.estimate import TraceEstimate as TraceEstimate
 from .traces.pixels import BlockEstimate as BlockEstimate

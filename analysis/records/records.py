@@ -109,8 +109,7 @@ Shapes = dict[str, dict[str, list[Count]]]
 class ProbeRecord(Struct, kw_only=True):
     """Results of `landscape probe`.
 
-    traces: by attribute (means, log_scales, quats, opacity_logits, sh).  quantiles: share -> the eigenvalue that this share of
-    all active ones does not exceed; None without a density.  finite_probe, depth, slice: None where left out.
+    traces: by attribute (means, log_scales, quats, opacity_logits, sh).  finite_probe, depth, slice: None where left out.
     steps: length of the optimiser's first step in a parameter, by attribute.  skipped: by the kind of work.  checks: symmetry,
     round_off, finiteness, finite_difference.  timing: stage -> seconds, in the order run, and "total".  notes: sentences on
     what was skipped, capped, or not reached.  arrays: group -> name -> shape.

@@ -34,7 +34,7 @@ CHECKPOINT, METRICS, SECONDS, RECORDS, COMPARISON = (
 )  # fmt: skip
 MAP = "map"  # RUN/map, a folder of `landscape map`
 NO_TIME = "no time"  # how the note of a record of a trajectory begins that was skipped for that
-STATES = ("whole", "coarse", "cut", "skipped")  # of a record of a trajectory
+STATES = ("whole", "coarse", "skipped")  # of a record of a trajectory
 TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
 WHOLE = ("step", "gaussians")  # columns of a trajectory

@@ -21,7 +21,6 @@ from rich.console import Console
 
 from analysis.console.drawing import draw
 from analysis.console.plain import say
-from analysis.probe.record import loss_name
 from analysis.records.findings import of_budgets, of_checks, unresolved
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import quantity
@@ -124,8 +123,8 @@ def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint], *, tr
 
 
 def require_same_loss(runs: Sequence[Run]) -> None:
-    """InputError where the records are of different losses; older ones do not name theirs, which is the training's."""
-    losses = [run.data.objective.loss or loss_name(run.checkpoint.training.config.loss) for run in runs]
+    """InputError where the records are of different losses."""
+    losses = [run.data.objective.loss for run in runs]
     for run, loss in zip(runs, losses, strict=True):
         if loss != losses[0]:
             raise InputError(

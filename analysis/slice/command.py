@@ -251,8 +251,7 @@ def _conclude(data: SliceRecord, out: Path) -> None:
         say(_finite_curvature(data.finite_probe))
     say(*(line.text for line in of_slice(data.slice, data.provenance)))
     say(*data.notes, style="yellow")
-    seconds = data.timing.get("total", sum(data.timing.values()))  # a file may lack it
-    say(f"{seconds:.1f} s, {data.counts.renders:,} renders of a view")
+    say(f"{data.timing['total']:.1f} s, {data.counts.renders:,} renders of a view")
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))) or "none"
     say(f"pictures: {pictures}; numbers: {data.FILE}, in {out}")
 

@@ -18,7 +18,7 @@ Columns:
 
     step, gaussians        steps done, and Gaussians after them
     state, note            "whole"; "coarse": traces from a few samples, ends to 10% or COARSE_MATVECS products, no density;
-                           "skipped": nothing measured, for the reason in the note; "cut" (older files): ended early by time
+                           "skipped": nothing measured, for the reason in the note
     seconds, time_share    of the record; of all records so far over those of the steps so far
     visible_gaussians, parameters    Gaussians in sight, and active parameters
     matvecs                products H v of the record

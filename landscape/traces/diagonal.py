@@ -1,4 +1,4 @@
-"""The diagonal of H, and its sums over groups of rows.
+"""The diagonal of H.
 
     method "signs"   probes z_i of random signs (Bekas, Kokiopoulou and Saad 2007)
     method "auto"    the default.  The first half of the probes are signs.  Where their products show that a sketch pays, they
@@ -9,24 +9,18 @@
 
 As in `choice`, a sketch pays where 4 r is below the variance of one a_i, summed over the entries; r is the square of what lies
 outside the sketch.
-
-The sensitivity of a group of rows (for a scene: a Gaussian) is the sum of |H_rr| over them.  |x| of an estimate x with a normal
-error s is too large on average, by s sqrt(2 / pi) where the true entry is zero and by less elsewhere.  `GroupSums.bias` is this
-excess at the estimated entries, summed over the group.  The standard error is that of the sum of sign_r H_rr with the estimated
-signs, and so includes the correlations between the errors of a group's rows.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import pi, sqrt
+from math import sqrt
 from typing import Literal
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.linalg import group_sums
 from landscape.operators.operator import SymmetricOperator, product, products
 from landscape.probes import draw_probes
 from landscape.results import Progress, ShortRepr
@@ -38,18 +32,6 @@ from landscape.traces.sketches.sketched_diagonal import sketched_samples
 Method = Literal["auto", "signs"]
 FEWEST = 4  # test vectors of a sketch
 SQUARED = 1e-140, 1e140  # numbers whose squares, and sums of them, are floats with all their digits
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class GroupSums(ShortRepr):
-    """sum |H_rr| over the rows of each group, with its standard error.
-
-    bias: the mean excess of `values` that noise causes (see the top of this module); it is not subtracted.
-    """
-
-    values: Float64[Tensor, " groups"]
-    standard_errors: Float64[Tensor, " groups"]
-    bias: Float64[Tensor, " groups"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,19 +54,6 @@ class DiagonalEstimate(ShortRepr):
         values, errors, samples = self.values[rows], self.standard_errors[rows], self.samples[rows]
         blocks = {name: slice(0, rows.stop - rows.start)}
         return replace(self, values=values, standard_errors=errors, samples=samples, blocks=blocks)
-
-    def sensitivity(self, groups: Int64[Tensor, " n"], count: int) -> GroupSums:
-        """sum |H_rr| over the rows of each of `count` groups.  groups: the number (from 0) of every row's group."""
-        if groups.shape != self.values.shape or not ((groups >= 0) & (groups < count)).all():
-            raise ValueError(
-                f"expected a group in 0..{count - 1} for each of {len(self.values)} rows, got shape {tuple(groups.shape)}"
-            )
-        groups = groups.to(self.values.device)
-        sums = group_sums(self.values.abs(), groups, count)
-        probes = self.samples.shape[1]
-        signed = group_sums(self.values.sign()[:, None] * self.samples, groups, count)
-        excess = group_sums(_folded_excess(self.values.abs(), self.standard_errors), groups, count)
-        return GroupSums(sums, signed.std(dim=1) / sqrt(probes), excess)
 
 
 def estimate_diagonal(
@@ -148,10 +117,3 @@ def _require_squares(largest: float) -> None:
 def _mean(samples: Float64[Tensor, "n k"], operator: SymmetricOperator, matvecs: int, method: str) -> DiagonalEstimate:
     errors = samples.std(dim=1) / sqrt(samples.shape[1])
     return DiagonalEstimate(samples.mean(dim=1), errors, samples, operator.blocks, matvecs, method)
-
-
-def _folded_excess(size: Tensor, error: Tensor) -> Tensor:
-    """E |x| - size for a normal x with the mean `size` and the standard deviation `error`."""
-    z = size / error.clamp_min(1e-300)
-    normal = torch.exp(-z.square() / 2) * sqrt(2 / pi)
-    return error * (normal - z * torch.special.erfc(z / sqrt(2)))

@@ -37,7 +37,7 @@ def swept(run: Path) -> float:
         (json.dumps({"train": SCORES}), 'another: expected the key "gaussians", got none;'),
         (
             json.dumps(METRICS | {"seconds": {"wall": "long"}}),
-            "another: expected `float | null`, got 'long' as \"seconds.wall\";",
+            "another: expected `float`, got 'long' as \"seconds.wall\";",
         ),
     ],
 )
