@@ -42,6 +42,7 @@ class SymmetricOperator(Protocol):
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         """H V.  The next call may overwrite it.  Raises ValueError unless V has the shape (dim, k) and the dtype."""
+        ...
 
 
 def require_vectors(V: Tensor, n: int, dtype: torch.dtype, device: torch.device | None = None) -> None:

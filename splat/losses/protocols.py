@@ -34,22 +34,28 @@ class LinearLoss(Protocol):
     @cached_property
     def diagonal(self) -> Float[Tensor, "3 H W"]:
         """The pixel-diagonal of l''."""
+        ...
 
     @property
     def bytes(self) -> int:
         """Memory of what is kept, the target's included."""
+        ...
 
     def scalar(self, like: Tensor) -> Float[Tensor, ""]:
         """The value where another tensor is, in its precision."""
+        ...
 
     def hvp(self, tangents: Float[Tensor, "k 4 H W"], out: Tensor | None = None) -> Float[Tensor, "k 4 H W"]:
         """l'' v for k tangents, to out (which may be the tangents themselves)."""
+        ...
 
     def curvatures(self, tangents: Float[Tensor, "k 4 H W"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
         """v . l'' v for k tangents, and v . D v with the diagonal D of l''."""
+        ...
 
     def workspace(self, vectors: int) -> int:
         """Bytes that `hvp` of so many tangents takes beside its result."""
+        ...
 
 
 class ImageLoss(Protocol):
@@ -57,12 +63,15 @@ class ImageLoss(Protocol):
 
     def padded(self, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 H W"]:
         """An image as the other methods take it, 0 in the padding."""
+        ...
 
     def cropped(self, planes: Float[Tensor, "k H W"]) -> Float[Tensor, "3 h w"]:
         """The first three planes without their padding."""
+        ...
 
     def consistency(self, x: Float[Tensor, "3 H W"], y: Float[Tensor, "3 H W"]) -> tuple[Float[Tensor, ""], Any]:
         """The loss between two images, and its gradients in both."""
+        ...
 
 
 class ViewLoss(ImageLoss, Protocol):
@@ -71,8 +80,10 @@ class ViewLoss(ImageLoss, Protocol):
     @property
     def couples_pixels(self) -> bool:
         """Whether the loss has second derivatives across pixels, as SSIM has."""
+        ...
 
     def value(self, image: Float[Tensor, "k H W"]) -> float: ...
 
     def linearize(self, image: Float[Tensor, "k H W"], second_order: bool = True) -> LinearLoss:
         """The loss at an image, which must not change; second_order: with products by its second derivative."""
+        ...

@@ -21,16 +21,20 @@ class Projection(Protocol):
     @property
     def jacobian(self) -> ProjectionJacobian:
         """The derivatives, Gaussian by Gaussian, as tensors."""
+        ...
 
     @property
     def bytes(self) -> int:
         """Memory of what is kept."""
+        ...
 
     def affects(self, block: Float[Tensor, "p k"]) -> bool:
         """Whether a vector moves any of the Gaussians at index; on a GPU always True, since to look is to wait for it."""
+        ...
 
     def jvp(self, block: Float[Tensor, "p k"]) -> Float[Tensor, "n k 9"]:
         """P' U; 0 for Gaussians that are not at index."""
+        ...
 
     def vjp(
         self,
@@ -39,6 +43,7 @@ class Projection(Protocol):
         total: Float[Tensor, "p k"] | None = None,
     ) -> Float[Tensor, "p k"]:
         """P'^T cotangents, plus (a . P'') block where a block is given; added to total, where that is given, in its place."""
+        ...
 
     def blocks(
         self, blocks: Float64[Tensor, "m 9 9"], second_order: bool
@@ -47,3 +52,4 @@ class Projection(Protocol):
 
         Over mean, log-scales, quaternion and opacity logit; and the diagonal of the SH block.
         """
+        ...

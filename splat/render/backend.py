@@ -46,6 +46,7 @@ class Adjoint(Protocol):
     @property
     def bytes(self) -> int:
         """Memory of what is kept beside the cotangent."""
+        ...
 
 
 class Tangent(Protocol):
@@ -58,6 +59,7 @@ class Tangent(Protocol):
 
         adjoint: of this raster; cotangents: the tangents of its cotangent, 0 for the second derivative of compositing alone.
         """
+        ...
 
 
 class Raster(Protocol):
@@ -80,37 +82,47 @@ class Raster(Protocol):
     @property
     def intersections_reached(self) -> int:
         """Number of intersections that some pixel reaches: a pass goes through these."""
+        ...
 
     @property
     def pairs(self) -> int:
         """Number of (pixel, splat) pairs that a pass evaluates."""
+        ...
 
     @property
     def touched(self) -> Int[Tensor, " m"]:
         """The splats that have such intersections."""
+        ...
 
     @property
     def draw_order(self) -> int:
         """The same number for rasters of which every tile draws the same splats in the same order."""
+        ...
 
     @property
     def bytes(self) -> int:
         """Memory of what is kept."""
+        ...
 
     def workspace(self, vectors: int) -> int:
         """Bytes that `jvp` and `backward_tangent` of so many tangents take, tangents and result included."""
+        ...
 
     def crop(self, planes: Float[Tensor, "*k H W"]) -> Float[Tensor, "*k h w"]:
         """A view of planes without padding."""
+        ...
 
     def pad(self, planes: Float[Tensor, "*k h w"]) -> Float[Tensor, "*k H W"]:
         """Planes with padding of 0, which has no weight in any derivative, in the precision of the pixels."""
+        ...
 
     def backward(self, cotangent: Float[Tensor, "4 H W"]) -> Adjoint:
         """The adjoint of the splats, given that of the planes."""
+        ...
 
     def jvp(self, directions: Float[Tensor, "n k 9"]) -> Tangent:
         """J u for tangents of the splats; rows of splats that are not `touched` are not read."""
+        ...
 
     def gaussian_blocks(
         self, adjoint: Any, curvature: Float[Tensor, "3 H W"], index: Int[Tensor, " m"], gauss_newton: bool
@@ -119,6 +131,7 @@ class Raster(Protocol):
 
         adjoint: of the loss's gradient; curvature: the pixel-diagonal of l''.
         """
+        ...
 
     def coupled_blocks(
         self, loss: Any, index: Int[Tensor, " m"]
@@ -127,9 +140,11 @@ class Raster(Protocol):
 
         index: ascending.  InputError where the device has no such kernel (`Backend.exact_blocks`).
         """
+        ...
 
     def dark_tiles(self, adjoint: Any, curvature: Float[Tensor, "3 H W"]) -> int:
         """Number of tiles with intersections that have neither slope nor curvature (as in `gaussian_blocks`) in any pixel."""
+        ...
 
 
 class Backend(Protocol):
@@ -141,6 +156,7 @@ class Backend(Protocol):
         self, gaussians: Gaussians, lens: Lens
     ) -> tuple[Float64[Tensor, "n 9"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
         """Splats, depths in the precision of the parameters, and which are drawn; ValueError as `require_sizes`."""
+        ...
 
     def project_vjp(
         self,
@@ -151,6 +167,7 @@ class Backend(Protocol):
         bar: Float64[Tensor, "n 9"],
     ) -> Float[Tensor, " p"]:
         """The gradient in the flat vector, given the plain adjoint of the splats: a product without what `Projection` keeps."""
+        ...
 
     def linearize_projection(
         self,
@@ -161,11 +178,13 @@ class Backend(Protocol):
         index: Int[Tensor, " m"],
     ) -> Projection:
         """The projection, linearised for the Gaussians at index; moments: the adjoint of the splats."""
+        ...
 
     def convert(
         self, way: int, splats: Float64[Tensor, "n 9"], numbers: Float[Tensor, "n 9"]
     ) -> Float64[Tensor, "n 9"]:
         """Tangents or adjoints of splats in other coordinates: `whitening.converted`."""
+        ...
 
     def rasterize(
         self,
@@ -178,17 +197,21 @@ class Backend(Protocol):
         settings: RenderSettings,
     ) -> Raster:
         """Composite a view.  splats: finite; depths: positive where drawn, in the precision of the pixels."""
+        ...
 
     def view_loss(self, target: Float[Tensor, "3 h w"], settings: LossSettings, like: Tensor) -> ViewLoss:
         """The loss of images against a target, on the device and in the dtype of the tensor `like`."""
+        ...
 
     def image_loss(self, image: Float[Tensor, "3 h w"], settings: LossSettings) -> ImageLoss:
         """The loss of two images of the size, dtype and device of this one."""
+        ...
 
     def adam(
         self, parameters: Tensor, gradient: Tensor, rates: Tensor, first: Tensor, second: Tensor, updates: int
     ) -> None:
         """One step of Adam in place: number `updates`, counted from 1 (`backend/cpu/adam.py`)."""
+        ...
 
 
 class CpuBackend:
