@@ -1,17 +1,22 @@
 """A scene of a dozen Gaussians and three small views, with a start that is not the truth."""
 
+from collections import deque
+
 import torch
 from torch import Tensor
 
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
+from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.densify import DensifySettings
+from splat.training.loop import train
 from splat.training.origin.fingerprint import ViewData
 from splat.training.origin.scene_reference import SceneReference
-from splat.training.state import TrainConfig
+from splat.training.state import MethodSettings, Step, TrainConfig, Training
 
 SMOOTH = RenderSettings(alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)  # no threshold that can be off
 WIDTH, HEIGHT, EXTENT = 20, 14, 2.0
@@ -49,13 +54,32 @@ def tiny_views(dtype: torch.dtype = torch.float32) -> list[View]:
 
 def tiny_config(iterations: int = 12, seed: int = 0) -> TrainConfig:
     """Every part of training happens within a dozen steps: densification, opacity reset, more bands, random colours."""
-    densify = DensifySettings(
-        every=2,
-        every_share=1.0,
-        reset_every=5,
-        stop_share=0.75,
-        gradient_threshold=1e-3,
-        clone_scale=0.11,
-        prune_scale=0.14,
-    )
+    schedule = {"every": 2, "every_share": 1.0, "reset_every": 5, "stop_share": 0.75}
+    densify = DensifySettings(gradient_threshold=1e-3, clone_scale=0.11, prune_scale=0.14, **schedule)
     return TrainConfig(iterations, seed, sh_degree=2, sh_degree_every=4, random_background=True, densify=densify)
+
+
+def trained(config: TrainConfig, start: Gaussians | None = None, views: list[View] | None = None) -> Training:
+    """A training from its first step to its last."""
+    return ended(Training.start(tiny_gaussians() if start is None else start, EXTENT, config), views)
+
+
+def ended(training: Training, views: list[View] | None = None) -> Training:
+    deque(train(training, views or tiny_views()), maxlen=0)
+    return training
+
+
+def a_step(method: MethodSettings, number: int = 1, views: list[View] | None = None, **others) -> Step:
+    """A step of a method in float64 that has chosen the second view.  others: of the training."""
+    views, config = views or tiny_views(torch.float64), TrainConfig(10, method=method, **others)
+    training = Training.start(tiny_gaussians(sh_degree=1, dtype=torch.float64), EXTENT, config)
+    training.method.on_start(training, views)
+    losses = [CpuViewLoss(view.image, config.loss, torch.float64) for view in views]
+    background = config.background_colour(torch.float64)
+    return Step(number, training, training.gaussians, views, 1, background, losses.__getitem__)
+
+
+def both_of(step: Step) -> tuple[LossAndGradient, LossAndGradient]:
+    """The photometric loss of a step, and what the method makes of it."""
+    base = step.loss_and_gradient(step.gaussians)
+    return base, step.training.method.gradient(step, base)

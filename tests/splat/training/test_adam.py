@@ -5,6 +5,7 @@ import torch
 from splat.backend.cpu.adam import EPS
 from splat.training.adam import Adam
 from splat.training.state import LearningRates, learning_rates
+from tests.splat.random_scenes import random_like
 from tests.splat.tiny import tiny_gaussians
 
 
@@ -22,11 +23,8 @@ def test_one_flat_adam_is_torch_adam_with_a_rate_per_attribute_and_band():
     }
     torch_adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in leaves.values()], eps=EPS)
     adam = Adam.zero(gaussians)
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(30):
-        gradient = gaussians.with_flat(
-            torch.randn(gaussians.flat.shape, generator=generator, dtype=torch.float64) * 1e-6
-        )
+    for step in range(30):
+        gradient = gaussians.with_flat(1e-6 * random_like(gaussians.flat.shape, step))
         adam.update(gaussians.flat, gradient.flat, learning_rates(gaussians, rates, 3.7e-4))
         each = gradient.attributes
         each["sh_constant"], each["sh_higher"] = each["sh"][:, :1], each["sh"][:, 1:]

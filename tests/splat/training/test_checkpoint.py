@@ -20,6 +20,9 @@ from splat.training.loop import train
 from splat.training.state import Training
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
+WHOLE = "whole number of more than 64 bits"
+LOSS = "loss.border, loss.eps, loss.literal, loss.opacity_reg, loss.scale_reg"
+
 
 @pytest.fixture(scope="module")
 def training() -> Training:
@@ -75,10 +78,11 @@ def test_a_write_that_fails_leaves_what_was_there_and_nothing_beside_it(path, mo
     assert path.read_bytes() == before and [file.name for file in path.parent.iterdir()] == [path.name]
 
 
-def refused(path: Path, message: str) -> None:
+def refused(path: Path, message: str) -> ValueError:
     with pytest.raises(ValueError, match=message) as caught:
         load_checkpoint(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    return caught.value
 
 
 def test_a_missing_file_is_reported(tmp_path):
@@ -86,11 +90,16 @@ def test_a_missing_file_is_reported(tmp_path):
         load_checkpoint(tmp_path / "checkpoint.pt")
 
 
-@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 nor a zip file", b"\x80\x02}q\x00."])
-def test_a_file_of_another_kind_is_refused(tmp_path, content):
-    path = tmp_path / "checkpoint.pt"
+PLY = b"ply\nformat binary_little_endian 1.0\n"
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 nor a zip file", b"\x80\x02}q\x00.", PLY])
+def test_a_file_of_another_kind_is_refused_and_what_was_wrong_is_kept(tmp_path, content):
+    path = tmp_path / ("point_cloud.ply" if content == PLY else "checkpoint.pt")
     path.write_bytes(content)
-    refused(path, "expected a checkpoint written by landscape train")
+    of = r" \(of other tools" if content == PLY else ": File is not a zip file; take another copy of the file"
+    caught = refused(path, f"expected a checkpoint written by landscape train.*damaged{of}")
+    assert content == PLY or isinstance(caught.__cause__, zipfile.BadZipFile)
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO])
@@ -113,9 +122,7 @@ def test_a_file_that_the_system_does_not_open_is_reported_in_its_words(path, mon
     "error",
     [
         MemoryError(),
-        RuntimeError(
-            "[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory: you tried to allocate"
-        ),
+        RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory"),
         OSError(errno.EIO, os.strerror(errno.EIO)),
         KeyboardInterrupt(),
     ],
@@ -130,14 +137,6 @@ def test_what_is_not_the_files_fault_is_never_called_damaged(path, monkeypatch, 
     with pytest.raises(type(error)) as caught:
         load_checkpoint(path)
     assert caught.value is error
-
-
-def test_what_was_wrong_with_a_damaged_file_is_said_and_kept(tmp_path):
-    path = tmp_path / "checkpoint.pt"
-    path.write_bytes(b"not a checkpoint")
-    with pytest.raises(InputError, match="damaged: File is not a zip file; take another copy of the file") as caught:
-        load_checkpoint(path)
-    assert isinstance(caught.value.__cause__, zipfile.BadZipFile)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
@@ -244,65 +243,54 @@ def test_every_key_is_checked(path, key):
 
 
 @pytest.mark.parametrize(
-    ("part", "key", "number"),
-    [("adam", "first", math.nan), ("adam", "second", -1e-9), ("screen_gradients", "total", math.inf)],
-)
-def test_saved_moments_and_sums_are_finite_and_squares_not_negative(path, part, key, number):
-    content = torch.load(path, weights_only=True)
-    content[part][key][1] = number
-    torch.save(content, path)
-    refused(path, f"'{key}' holds a number that is not finite")
-
-
-def test_a_ply_file_is_refused_by_its_name(tmp_path):
-    path = tmp_path / "point_cloud.ply"
-    path.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
-    refused(path, r"damaged \(of other tools")
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
+    ("place", "value", "message"),
     [
-        ("iterations", "many", "'config.iterations': expected int, got str"),
-        ("background", (0.0, 1.0), "'config.background': expected array of length 3, got 2"),
-        ("seed", -1, "'config.seed': expected int >= 0, got -1"),
+        (("adam", "first", 1), math.nan, "'first' holds a number that is not finite"),
+        (("adam", "second", 1), -1e-9, "'second' holds a number that is not finite"),
+        (("adam", "updates"), -1, "'adam.updates': expected int >= 0, got -1"),
+        (("adam", "updates"), 9, "optimiser has made 9 updates in 8 steps"),
+        (("adam", "updates"), 10**400, f"'adam.updates': expected int <= 9223372036854775807, got a {WHOLE}"),
+        (("screen_gradients", "total", 1), math.inf, "'total' holds a number that is not finite"),
+        (("scene", "views", "view1"), None, "it does not say what was seen of 1 of its views, such as 'view1'"),
+        (("flat", 4), torch.nan, "expected finite means.*at Gaussian 1"),
+        (("flat",), torch.zeros(0), "expected at least one Gaussian, got none"),
+        (("flat",), torch.zeros(14, dtype=torch.float16), "'flat' is torch.float16"),
+        (("flat",), torch.ones(1).expand(23 * 10**12), "does not hold its numbers one by one"),
+        (("flat",), torch.zeros(23, device="meta"), "does not hold its numbers one by one"),
+        (("config", "densify", "stop"), 2**63, f"'config.densify.stop': expected int.*, got a {WHOLE}"),
+        (("config", "densify", "stop"), 10**30, f"'config.densify.stop': expected int.*, got a {WHOLE}"),
+        (("config", "rates", "position"), 10**400, f"'config.rates.position': expected float.*, got a {WHOLE}"),
+        (("config", "render", "contour_sigma"), 10**400, f"'config.render.contour_sigma': expected .*got a {WHOLE}"),
+        (("config", "iterations"), "many", "'config.iterations': expected int, got str"),
+        (("config", "iterations"), torch.zeros(50, 50), "'config.iterations': expected int, got Tensor"),
+        (("config", "background"), (0.0, 1.0), "'config.background': expected array of length 3, got 2"),
+        (("config", "background"), (0.0, "many " * 100, 1.0), r"'config.background\[1\]': expected float, got str"),
+        (("config", "seed"), -1, "'config.seed': expected int >= 0, got -1"),
+        (("config", "loss"), {"pixel": "l1"}, f"missing or unknown keys: {LOSS}"),
         (
-            "loss",
-            {"pixel": "l1"},
-            "missing or unknown keys: loss.border, loss.eps, loss.literal, loss.opacity_reg, loss.scale_reg",
+            ("config", "loss", "pixel"),
+            "lots",
+            "'config.loss.pixel': expected 'l1' or 'charbonnier' or 'l2', got 'lots'",
         ),
-        ("method", {"name": "magic"}, "'config.method' has the unknown name 'magic'"),
-        ("method", {"name": "stablegs"}, "'config' has missing or unknown keys: method.accuracy"),
-        ("method", "3dgs", "'config.method': expected object, got str"),
-        ("method", {"name": torch.zeros(2000)}, "'config.method.name': expected str, got Tensor"),
-        ("iterations", torch.zeros(50, 50), "'config.iterations': expected int, got Tensor"),
-        ("method", {"name": "magic " * 100}, "unknown name '(magic ){13}ma', expected one of 3dgs, stablegs"),
-        ("loss", {"pixel": "lots"}, "'config.loss.pixel': expected 'l1' or 'charbonnier' or 'l2', got 'lots'"),
-        ("background", (0.0, "many " * 100, 1.0), r"'config.background\[1\]': expected float, got str"),
+        (("config", "method"), {"name": "magic"}, "'config.method' has the unknown name 'magic'"),
+        (("config", "method"), {"name": "stablegs"}, "'config' has missing or unknown keys: method.accuracy"),
+        (("config", "method"), "3dgs", "'config.method': expected object, got str"),
+        (("config", "method", "name"), torch.zeros(2000), "'config.method.name': expected str, got Tensor"),
+        (("config", "method", "name"), "magic " * 100, "unknown name '(magic ){13}ma', expected one of 3dgs, stablegs"),
     ],
 )
-def test_settings_in_a_checkpoint_are_checked_like_any_others(path, key, value, message):
+def test_what_no_training_saves_is_refused_by_its_key(path, place, value, message):
     content = torch.load(path, weights_only=True)
-    content["config"][key] = value
+    *to, last = place
+    at = content
+    for key in to:
+        at = at[key]
+    if value is None:
+        del at[last]
+    else:
+        at[last] = value
     torch.save(content, path)
     refused(path, message)
-
-
-@pytest.mark.parametrize(
-    ("part", "key", "number"),
-    [
-        ("densify", "stop", 2**63),
-        ("densify", "stop", 10**30),
-        ("rates", "position", 10**400),
-        ("render", "contour_sigma", 10**400),
-    ],
-    ids=["2^63", "10^30", "rate", "sigma"],
-)
-def test_whole_numbers_that_no_machine_number_holds_are_refused(path, part, key, number):
-    content = torch.load(path, weights_only=True)
-    content["config"][part][key] = number
-    torch.save(content, path)
-    refused(path, f"'config.{part}.{key}': expected (int|float).*, got a whole number of more than 64 bits")
 
 
 def test_whole_numbers_in_place_of_real_ones_are_taken(path):
@@ -312,44 +300,6 @@ def test_whole_numbers_in_place_of_real_ones_are_taken(path):
     torch.save(content, path)
     config = load_checkpoint(path).training.config
     assert config.render.contour_sigma == 2**59 and config.rates.quats == 1
-
-
-def test_an_optimiser_that_made_more_updates_than_steps_is_refused(path):
-    content = torch.load(path, weights_only=True)
-    content["adam"]["updates"] = 9
-    torch.save(content, path)
-    refused(path, "optimiser has made 9 updates in 8 steps")
-    content["adam"]["updates"] = 10**400
-    torch.save(content, path)
-    refused(path, "'adam.updates': expected int <= 9223372036854775807, got a whole number of more than 64 bits")
-
-
-def test_parameters_that_are_not_finite_are_refused_by_name(path):
-    content = torch.load(path, weights_only=True)
-    content["flat"][4] = torch.nan
-    torch.save(content, path)
-    refused(path, "expected finite means.*at Gaussian 1")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"flat": torch.zeros(0)}, "expected at least one Gaussian, got none"),
-        ({"flat": torch.zeros(14, dtype=torch.float16)}, "'flat' is torch.float16"),
-        ({"flat": torch.ones(1).expand(23 * 10**12)}, "does not hold its numbers one by one"),
-        ({"flat": torch.zeros(23, device="meta")}, "does not hold its numbers one by one"),
-    ],
-)
-def test_parameters_that_are_no_plain_numbers_are_refused_unread(path, change, message):
-    torch.save({**torch.load(path, weights_only=True), **change}, path)
-    refused(path, message)
-
-
-def test_an_optimiser_that_made_less_than_no_update_is_refused(path):
-    content = torch.load(path, weights_only=True)
-    content["adam"]["updates"] = -1
-    torch.save(content, path)
-    refused(path, "'adam.updates': expected int >= 0, got -1")
 
 
 def test_a_checkpoint_of_float64_comes_back_in_float64(tmp_path):
@@ -380,13 +330,6 @@ def test_a_checkpoint_of_another_version_is_refused_in_one_sentence(path, versio
     del content["scene"]["views"]  # as in older files
     torch.save(content | {"version": version}, path)
     refused(path, f"its format version is {version}, this program reads {VERSION}; take another copy .*, or train anew")
-
-
-def test_a_checkpoint_says_what_was_seen_of_every_view(path):
-    content = torch.load(path, weights_only=True)
-    del content["scene"]["views"]["view1"]
-    torch.save(content, path)
-    refused(path, "it does not say what was seen of 1 of its views, such as 'view1'")
 
 
 @pytest.mark.parametrize("name", ["train.csv", "probe/probe.json", "metrics.json"])

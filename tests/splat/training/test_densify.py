@@ -144,12 +144,9 @@ def test_gaussians_count_as_seen_when_their_3_sigma_box_meets_the_image():
 def test_screen_gradients_are_mean_ndc_norms_over_renders_that_show_it():
     camera = tiny_views()[0].camera
     gradients = ScreenGradients.zero(3, torch.float32)
-    gradients.add(
-        torch.tensor([[3.0, 0.0], [1.0, 1.0], [0.0, 0.0]]), splats_at((5.0, 5.0), (5.0, 5.0), (-9.0, 0.0)), camera
-    )
-    gradients.add(
-        torch.tensor([[0.0, 1.0], [1.0, 1.0], [0.0, 0.0]]), splats_at((5.0, 5.0), (-9.0, 5.0), (-9.0, 0.0)), camera
-    )
+    for first, second_at in (([3.0, 0.0], (5.0, 5.0)), ([0.0, 1.0], (-9.0, 5.0))):
+        splats = splats_at((5.0, 5.0), second_at, (-9.0, 0.0))
+        gradients.add(torch.tensor([first, [1.0, 1.0], [0.0, 0.0]]), splats, camera)
     half_w, half_h = WIDTH / 2, HEIGHT / 2
     expected = torch.tensor([(3 * half_w + half_h) / 2, (half_w**2 + half_h**2) ** 0.5, 0.0])
     torch.testing.assert_close(gradients.mean, expected)

@@ -1,11 +1,7 @@
-"""The training loop: schedules, determinism, and what a killed training resumes to."""
+"""The training loop: schedules, determinism, and what a saved training resumes to."""
 
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 from math import sqrt
-from pathlib import Path
 
 import pytest
 import torch
@@ -27,15 +23,10 @@ from splat.training.densify import DensifySettings, densify
 from splat.training.loop import prepare, train, with_background
 from splat.training.score.evaluate import evaluate
 from splat.training.state import LearningRates, TrainConfig, Training, learning_rates, position_rate
-from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
-from tests.waiting import PATIENCE
+from tests.refusals import refused
+from tests.splat.tiny import EXTENT, REFERENCE, ended, tiny_config, tiny_gaussians, tiny_views, trained
 
 ONLY_ADAM = DensifySettings(enabled=False)
-
-
-def run(config: TrainConfig, dtype: torch.dtype = torch.float32):
-    training = Training.start(tiny_gaussians(dtype=dtype), EXTENT, config)
-    return training, list(train(training, tiny_views(dtype)))
 
 
 def test_mip_splattings_filter_is_renewed_when_its_training_does_and_resumes(monkeypatch, tmp_path):
@@ -66,7 +57,8 @@ def test_mip_splattings_filter_is_renewed_when_its_training_does_and_resumes(mon
 @pytest.mark.parametrize("loss", [LossSettings(), LossSettings(opacity_reg=0.3, scale_reg=0.5)], ids=["3DGS", "MCMC"])
 def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands(loss):
     config = TrainConfig(10, seed=3, sh_degree=1, sh_degree_every=4, densify=ONLY_ADAM, loss=loss)
-    training, progress = run(config, torch.float64)
+    training = Training.start(tiny_gaussians(dtype=torch.float64), EXTENT, config)
+    progress = list(train(training, tiny_views(torch.float64)))
 
     views = {view.name: view for view in tiny_views(torch.float64)}
     gaussians = tiny_gaussians(dtype=torch.float64).select(torch.arange(12), sh_degree=1)
@@ -74,9 +66,8 @@ def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands(loss):
     constant, higher = (part.clone().requires_grad_() for part in gaussians.sh.split([1, 3], dim=1))
     rates = {"means": 0.0, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 0.05}
     groups = [{"params": [leaves[name]], "lr": rate} for name, rate in rates.items()]
-    adam = torch.optim.Adam(
-        [*groups, {"params": [constant], "lr": 2.5e-3}, {"params": [higher], "lr": 1.25e-4}], eps=EPS
-    )
+    groups += [{"params": [constant], "lr": 2.5e-3}, {"params": [higher], "lr": 1.25e-4}]
+    adam = torch.optim.Adam(groups, eps=EPS)
     for done in progress:
         adam.param_groups[0]["lr"] = EXTENT * 1.6e-4 * 0.01 ** (done.step / 10)
         mask = 0.0 if done.step <= 4 else 1.0
@@ -109,18 +100,15 @@ def test_pictures_and_losses_that_do_not_fit_are_made_anew_and_change_nothing(mo
     assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
-def test_position_rate_decays_exponentially_to_its_final_value():
-    rates = LearningRates()
-    assert position_rate(rates, 3.0, 0, 700) == pytest.approx(3.0 * rates.position, rel=1e-14)
-    assert position_rate(rates, 3.0, 700, 700) == pytest.approx(3.0 * rates.position_final, rel=1e-14)
-    assert position_rate(rates, 1.0, 350, 700) == pytest.approx(sqrt(rates.position * rates.position_final), rel=1e-14)
-
-
-def test_the_position_rate_is_held_for_its_first_steps():
-    rates = LearningRates(position_hold=100)
-    assert {position_rate(rates, 3.0, step, 700) for step in (1, 50, 100)} == {3.0 * rates.position}
-    assert position_rate(rates, 1.0, 400, 700) == pytest.approx(sqrt(rates.position * rates.position_final), rel=1e-14)
-    assert position_rate(rates, 3.0, 700, 700) == pytest.approx(3.0 * rates.position_final, rel=1e-14)
+def test_the_position_rate_is_held_for_its_first_steps_and_decays_exponentially_to_its_final_value():
+    for hold, held in ((0, [0]), (100, [1, 50, 100])):
+        rates = LearningRates(position_hold=hold)
+        assert [position_rate(rates, 3.0, step, 700) for step in held] == [pytest.approx(3 * 1.6e-4, rel=1e-14)] * len(
+            held
+        )
+        middle = sqrt(rates.position * rates.position_final)
+        assert position_rate(rates, 1.0, (hold + 700) // 2, 700) == pytest.approx(middle, rel=1e-14)
+        assert position_rate(rates, 3.0, 700, 700) == pytest.approx(3.0 * rates.position_final, rel=1e-14)
     assert position_rate(LearningRates(position_hold=900), 1.0, 700, 700) == rates.position
 
 
@@ -156,7 +144,7 @@ def test_a_band_joins_after_every_so_many_steps_until_the_highest():
 
 
 def test_every_epoch_shows_each_view_once_in_a_new_order():
-    _, progress = run(TrainConfig(30, densify=ONLY_ADAM))
+    progress = list(train(Training.start(tiny_gaussians(), EXTENT, TrainConfig(30, densify=ONLY_ADAM)), tiny_views()))
     epochs = [tuple(done.view for done in progress[i : i + 3]) for i in range(0, 30, 3)]
     assert all(sorted(epoch) == ["view0", "view1", "view2"] for epoch in epochs)
     assert len(set(epochs)) > 1
@@ -189,105 +177,39 @@ def test_the_tiny_run_clones_splits_prunes_resets_and_raises_the_degree(monkeypa
     assert training.gaussians.sh_degree == 2
 
 
-@pytest.mark.parametrize(
-    ("background", "drawn", "resets"),
-    [
-        ((1.0, 1.0, 1.0), False, [3, 5]),
-        ((1.0, 1.0, 1.0), True, [5]),
-        ((0.0, 0.0, 0.0), False, [5]),
-        ((1.0, 1.0, 0.9), False, [5]),
-    ],
-)
-def test_on_white_opacities_are_also_reset_before_density_control(background, drawn, resets):
-    config = replace(tiny_config(), background=background, random_background=drawn)
+@pytest.mark.parametrize(("blue", "drawn", "resets"), [(1.0, False, [3, 5]), (1.0, True, [5]), (0.9, False, [5])])
+def test_on_white_opacities_are_also_reset_before_density_control(blue, drawn, resets):
+    config = replace(tiny_config(), background=(1.0, 1.0, blue), random_background=drawn)
     training = Training.start(tiny_gaussians(), EXTENT, config)
-    highest = {
-        done.step: training.gaussians.opacity_logits.sigmoid().max().item() for done in train(training, tiny_views())
-    }
-    assert [
-        step for step, opacity in highest.items() if opacity <= 0.010001
-    ] == resets  # the next update lifts some again
+    highest = [training.gaussians.opacity_logits.sigmoid().max().item() for _ in train(training, tiny_views())]
+    lowered = [step for step, opacity in enumerate(highest, 1) if opacity <= 0.010001]
+    assert lowered == resets  # the next update lifts some again
 
 
-def checkpoint_bytes(config: TrainConfig, path: Path) -> bytes:
-    training, _ = run(config)
-    save_checkpoint(path, training, REFERENCE)
-    return path.read_bytes()
-
-
-def test_the_same_seed_alone_gives_the_same_checkpoint_bit_for_bit(tmp_path):
-    first = checkpoint_bytes(tiny_config(), tmp_path / "first.pt")
-    assert checkpoint_bytes(tiny_config(), tmp_path / "again.pt") == first
-    one, _ = run(tiny_config(seed=0))
-    other, _ = run(tiny_config(seed=1))
-    assert one.gaussians.flat.shape != other.gaussians.flat.shape or not torch.equal(
-        one.gaussians.flat, other.gaussians.flat
-    )
-
-
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
-from splat.training.checkpoint import save_checkpoint
-from splat.training.loop import train
-from splat.training.state import Training
-training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
-for done in train(training, tiny_views()):
-    if done.step % 4 == 0:
-        save_checkpoint(Path(sys.argv[1]), training, REFERENCE)
-    if done.step == 7:
-        os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_a_training_killed_and_resumed_ends_with_the_same_bytes(tmp_path):
-    path = tmp_path / "checkpoint.pt"
-    command = [sys.executable, "-c", KILLED, str(path)]
-    result = subprocess.run(command, cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=PATIENCE)
-    assert result.returncode == -signal.SIGKILL, result.stderr
-
-    loaded = load_checkpoint(path)
-    assert loaded.training.step == 4
-    for _ in train(loaded.training, tiny_views()):
-        pass
-    save_checkpoint(path, loaded.training, loaded.scene)
-    assert path.read_bytes() == checkpoint_bytes(tiny_config(), tmp_path / "uninterrupted.pt")
-
-
-@pytest.mark.parametrize("stop", range(1, 12))
-def test_a_training_saved_after_any_step_continues_to_the_same_bits(tmp_path, stop, uninterrupted):
-    path = tmp_path / "checkpoint.pt"
-    training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
+def test_a_training_saved_after_any_step_continues_to_the_same_bits_and_another_seed_to_others(tmp_path):
+    training, kept = Training.start(tiny_gaussians(), EXTENT, tiny_config()), []
     for done in train(training, tiny_views()):
-        if done.step == stop:
-            break
-    save_checkpoint(path, training, REFERENCE)
-    resumed = load_checkpoint(path).training
-    for _ in train(resumed, tiny_views()):
-        pass
-    save_checkpoint(path, resumed, REFERENCE)
-    assert path.read_bytes() == uninterrupted
-
-
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory) -> bytes:
-    return checkpoint_bytes(tiny_config(), tmp_path_factory.mktemp("uninterrupted") / "checkpoint.pt")
+        kept.append(tmp_path / f"{done.step}.pt")
+        save_checkpoint(kept[-1], training, REFERENCE)
+    end = kept[-1].read_bytes()
+    for path in kept[:-1]:
+        save_checkpoint(path, ended(load_checkpoint(path).training), REFERENCE)
+        assert path.read_bytes() == end
+    save_checkpoint(path, trained(tiny_config()), REFERENCE)
+    assert path.read_bytes() == end
+    assert not torch.equal(trained(tiny_config(seed=1)).gaussians.flat, training.gaussians.flat)
 
 
 def test_training_brings_the_views_closer():
-    views = tiny_views()
-    config = TrainConfig(60, sh_degree=0, densify=ONLY_ADAM)
-    training, _ = run(config)
-    before, after = evaluate(tiny_gaussians(), views), evaluate(training.gaussians, views)
+    training = trained(TrainConfig(60, sh_degree=0, densify=ONLY_ADAM))
+    before, after = (evaluate(gaussians, tiny_views()) for gaussians in (tiny_gaussians(), training.gaussians))
     assert after.psnr > before.psnr + 3 and after.ssim > before.ssim
 
 
 def test_a_training_does_not_touch_the_gaussians_that_it_starts_from():
     start = tiny_gaussians()
     before = start.flat.clone()
-    for _ in train(Training.start(start, EXTENT, TrainConfig(2)), tiny_views()):
-        pass
+    trained(TrainConfig(2), start)
     assert torch.equal(start.flat, before)
 
 
@@ -311,33 +233,28 @@ def test_a_random_background_is_drawn_anew_at_each_step(monkeypatch):
         return background_of(gaussians, background)
 
     monkeypatch.setattr("splat.render.loss_and_gradient.background_of", recorded)
-    run(TrainConfig(4, random_background=True))
+    trained(TrainConfig(4, random_background=True))
     assert len(set(colours)) == 4
     colours.clear()
-    run(TrainConfig(4, background=(0.25, 0.5, 1.0)))
+    trained(TrainConfig(4, background=(0.25, 0.5, 1.0)))
     assert set(colours) == {(0.25, 0.5, 1.0)}
 
 
 def test_a_start_that_cannot_be_trained_is_refused():
     config = TrainConfig(1, sh_degree=1)
-    with pytest.raises(ValueError, match="at least one Gaussian"):
-        Training.start(tiny_gaussians(0), EXTENT, config)
-    with pytest.raises(ValueError, match="at most the training's SH degree 1, got 2"):
-        Training.start(tiny_gaussians(sh_degree=2), EXTENT, config)
-    with pytest.raises(ValueError, match="extent"):
-        Training.start(tiny_gaussians(), 0.0, config)
+    refused("at least one Gaussian", Training.start, tiny_gaussians(0), EXTENT, config)
+    refused("at most the training's SH degree 1, got 2", Training.start, tiny_gaussians(sh_degree=2), EXTENT, config)
+    refused("extent", Training.start, tiny_gaussians(), 0.0, config)
     broken = tiny_gaussians()
     broken.quats[3, 1] = torch.nan
-    with pytest.raises(ValueError, match=r"finite quats.*Gaussian 3"):
-        Training.start(broken, EXTENT, config)
-    with pytest.raises(ValueError, match="at least one view"):
-        next(train(Training.start(tiny_gaussians(), EXTENT, config), []))
+    refused(r"finite quats.*Gaussian 3", Training.start, broken, EXTENT, config)
+    refused("at least one view", next, train(Training.start(tiny_gaussians(), EXTENT, config), []))
 
 
 def test_a_training_that_loses_every_gaussian_says_so():
     nothing_stays = DensifySettings(every=1, start_share=0.1, reset_opacity=0.9999, min_opacity=0.9998)
     with pytest.raises(ValueError, match="every Gaussian became transparent or too large by step 2"):
-        run(replace(tiny_config(), densify=nothing_stays))
+        trained(replace(tiny_config(), densify=nothing_stays))
 
 
 def test_a_loss_that_is_not_finite_names_the_step_and_the_view():
@@ -345,8 +262,7 @@ def test_a_loss_that_is_not_finite_names_the_step_and_the_view():
     for view in views:
         view.image[:] = torch.inf
     training = Training.start(tiny_gaussians(), EXTENT, TrainConfig(1, loss=LossSettings(ssim_weight=0.0)))
-    with pytest.raises(ValueError, match=r"finite loss, got inf at step 1 on view view\d"):
-        next(train(training, views))
+    refused(r"finite loss, got inf at step 1 on view view\d", next, train(training, views))
 
 
 def test_a_gradient_that_is_not_finite_is_refused_before_it_is_used(monkeypatch):
@@ -361,8 +277,7 @@ def test_a_gradient_that_is_not_finite_is_refused_before_it_is_used(monkeypatch)
         return replace(base, gradient=gradient)
 
     monkeypatch.setattr(training.method, "gradient", broken)
-    with pytest.raises(ValueError, match=r"finite gradient, got nan at step 2 on view view\d; lower the rates"):
-        next(steps)
+    refused(r"finite gradient, got nan at step 2 on view view\d; lower the rates", next, steps)
     after = [each.flat for each in (training.gaussians, training.adam.first, training.adam.second)]
     assert all(map(torch.equal, after, before)) and training.step == training.adam.updates == 1
 
@@ -382,10 +297,7 @@ def test_gaussians_nearer_than_the_near_plane_are_refused_before_a_step():
     gaussians.means.mul_(1e-3)
     small = [replace(view, camera=replace(view.camera, centre=view.camera.centre * 1e-3)) for view in views]
     training = Training.start(gaussians, EXTENT, tiny_config(16))
-    with pytest.raises(
-        InputError, match=rf"got {len(gaussians)}, of which none of {len(views)} views .* up to [1-9]\d* lie nearer"
-    ):
-        prepare(training, small)
+    refused(r"got 12, of which none of 3 views .* up to [1-9]\d* lie nearer", prepare, training, small)
     gaussians.means.fill_(1e6)  # neither near nor in an image
     with pytest.raises(InputError, match=r"up to 0 lie nearer than the near plane at 0\.2"):
         prepare(Training.start(gaussians, EXTENT, tiny_config(16)), small)
@@ -403,17 +315,11 @@ def test_gaussians_that_density_control_cannot_use_or_makes_end_a_training_with_
     settings, gradients = DensifySettings(), torch.ones(len(training.gaussians))
     training.gaussians.log_scales.fill_(100.0)  # finite, but not the places that are drawn from them
     change = densify(training.gaussians, gradients, EXTENT, settings, training.generator, prune_large=False)
-    with pytest.raises(InputError, match="expected finite means, got"):
-        training.replace_gaussians(change)
-    far = Training.start(tiny_gaussians(), EXTENT, tiny_config(16))
-    base = loss_and_gradient(
-        far.gaussians,
-        tiny_views()[0].camera,
-        far.config.loss_against(tiny_views()[0].image, far.gaussians.flat),
-        torch.zeros(3),
-    )
+    refused("expected finite means, got", training.replace_gaussians, change)
+    far, view = Training.start(tiny_gaussians(), EXTENT, tiny_config(16)), tiny_views()[0]
+    loss = far.config.loss_against(view.image, far.gaussians.flat)
+    base = loss_and_gradient(far.gaussians, view.camera, loss, torch.zeros(3))
     far.gaussians.means[0] = float("inf")
     schedule = far.config.densify
     step = next(n for n in range(1, 16) if schedule.densifies(n, 16))
-    with pytest.raises(InputError, match=r"expected finite means, got .*inf"):
-        far.control_density(step, tiny_views()[0].camera, base)
+    refused(r"expected finite means, got .*inf", far.control_density, step, view.camera, base)

@@ -6,20 +6,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
 from splat.model.camera import Camera
 from splat.model.capture import capture_geometry
-from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training.densify import DensifySettings
 from splat.training.loop import train
 from splat.training.methods import corgs
 from splat.training.methods.corgs import CoRGS, CoRGSMethod, confirmed, pseudo_view
-from splat.training.methods.methods import ThreeDGS
 from splat.training.state import Step, TrainConfig, Training
+from tests.refusals import refused
 from tests.splat.random_scenes import random_camera
-from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
+from tests.splat.tiny import EXTENT, a_step, both_of, tiny_config, tiny_gaussians, tiny_views
 
 APART = CoRGS(prune_every=1000, prune_start=3, weight=0.0)
 TOGETHER = CoRGS(prune_every=4, prune_start=3, distance=0.3, pseudo_start=5)
@@ -32,24 +30,19 @@ def trained(config: TrainConfig) -> tuple[Training, CoRGSMethod, list[int]]:
     return training, training.method, counts
 
 
-def a_step(settings: CoRGS, number: int) -> tuple[Step, Training]:
+def step_of(settings: CoRGS, number: int) -> tuple[Step, Training]:
     """A step at which the partner is another scene."""
-    views, config = tiny_views(torch.float64), TrainConfig(20, background=(0.2, 0.4, 0.1), method=settings)
-    training = Training.start(tiny_gaussians(sh_degree=1, dtype=torch.float64), EXTENT, config)
-    method = training.method
-    assert isinstance(method, CoRGSMethod)
-    method.on_start(training, views)
-    partner = method.partner
+    step = a_step(settings, number, background=(0.2, 0.4, 0.1))
+    assert isinstance(step.training.method, CoRGSMethod)
+    partner = step.training.method.partner
     assert partner is not None
     partner.gaussians = tiny_gaussians(sh_degree=1, seed=3, dtype=torch.float64)
-    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
-    background = torch.tensor(config.background, dtype=torch.float64)
-    return Step(number, training, training.gaussians, views, 1, background, lambda _: loss), partner
+    return step, partner
 
 
 def test_with_neither_term_the_first_field_is_that_of_3dgs():
     training, _, counts = trained(replace(tiny_config(), method=APART))
-    plain = Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=ThreeDGS()))
+    plain = Training.start(tiny_gaussians(), EXTENT, tiny_config())
     assert counts == [done.gaussians for done in train(plain, tiny_views())]
     assert torch.equal(training.gaussians.flat, plain.gaussians.flat)
 
@@ -57,8 +50,7 @@ def test_with_neither_term_the_first_field_is_that_of_3dgs():
 def test_a_state_whose_partner_is_no_training_is_refused():
     method = CoRGS().create(0)
     method.restore(method.state())
-    with pytest.raises(ValueError, match="'partner' is no training"):
-        method.restore({**method.state(), "partner": {"step": 1}})
+    refused("'partner' is no training", method.restore, {**method.state(), "partner": {"step": 1}})
 
 
 def test_a_partner_that_was_restored_goes_on_where_the_first_field_is():
@@ -88,10 +80,9 @@ def test_each_field_descends_its_loss_and_its_disagreement_with_the_other(monkey
     poses, descended = [], []
     posing = corgs.pseudo_view
     monkeypatch.setattr(corgs, "pseudo_view", lambda *a: poses.append(posing(*a)) or poses[-1])
-    step, partner = a_step(CoRGS(pseudo_start=5, weight=0.7), number)
+    step, partner = step_of(CoRGS(pseudo_start=5, weight=0.7), number)
     monkeypatch.setattr(partner, "descend", lambda gradient, at: descended.append((gradient, at)))
-    base = loss_and_gradient(step.gaussians, step.camera, step.loss_of(step.chosen), step.background)
-    own = step.training.method.gradient(step, base).gradient
+    own = both_of(step)[1].gradient
     assert len(poses) == (weight > 0) and [at for _, at in descended] == [number]
 
     fields = step.gaussians, tiny_gaussians(sh_degree=1, seed=3, dtype=torch.float64)
@@ -118,7 +109,7 @@ def test_a_gaussian_is_confirmed_by_the_nearest_one_of_the_other_field():
 
 
 def test_both_fields_lose_what_the_other_did_not_confirm_before_the_change():
-    step, partner = a_step(replace(TOGETHER, distance=0.35), number=8)
+    step, partner = step_of(replace(TOGETHER, distance=0.35), number=8)
     one, other = step.training.gaussians, partner.gaussians
     apart = torch.cdist(one.means, other.means)
     stays = apart.amin(dim=1) <= 0.35, apart.amin(dim=0) <= 0.35
@@ -137,10 +128,9 @@ def test_fields_are_pruned_at_every_so_many_steps_after_the_start():
 
 
 def test_fields_that_confirm_nothing_of_each_other_are_an_error():
-    step, partner = a_step(replace(TOGETHER, distance=0.01), number=8)
+    step, partner = step_of(replace(TOGETHER, distance=0.01), number=8)
     partner.gaussians.means[:] += 9
-    with pytest.raises(ValueError, match=r"within 0.01 of each other, got none at step 8"):
-        step.training.method.after_step(step)
+    refused(r"within 0.01 of each other, got none at step 8", step.training.method.after_step, step)
 
 
 def test_a_pseudo_view_is_half_turned_to_the_nearest_camera_and_jittered():

@@ -12,6 +12,7 @@ from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.score.evaluate import evaluate, have_masks, score
 from tests.oracles import similarity_by_windows
+from tests.refusals import refused
 from tests.splat.tiny import tiny_gaussians, tiny_views
 
 
@@ -29,8 +30,7 @@ def test_scores_are_those_of_each_render_and_their_means():
 
 
 def test_without_views_there_is_no_score():
-    with pytest.raises(ValueError, match="at least one view"):
-        evaluate(tiny_gaussians(), [])
+    refused("at least one view", evaluate, tiny_gaussians(), [], error=ValueError)
 
 
 def masked_view() -> View:
@@ -43,9 +43,8 @@ def masked_view() -> View:
 def test_inside_a_mask_psnr_is_of_its_pixels_and_ssim_of_white_outside():
     view, image = masked_view(), torch.rand(3, 14, 20, generator=torch.Generator().manual_seed(2)) * 1.4 - 0.2
     assert view.mask is not None
-    errors = [
-        float((image[c, i, j].clamp(0, 1) - view.image[c, i, j]) ** 2) for c in range(3) for i, j in view.mask.nonzero()
-    ]
+    inside = [(c, i, j) for c in range(3) for i, j in view.mask.nonzero()]
+    errors = [float((image[at].clamp(0, 1) - view.image[at]) ** 2) for at in inside]
     result = score(image, view)
     assert result.psnr == pytest.approx(-10 * log10(sum(errors) / len(errors)), rel=1e-6)
     white = [p.clamp(0, 1) * view.mask + ~view.mask for p in (image, view.image)]
@@ -71,8 +70,7 @@ def test_nothing_outside_a_mask_counts():
 def test_views_that_are_scored_together_have_all_masks_or_none():
     views = tiny_views()
     masked = [masked_view(), *views[1:]]
-    with pytest.raises(ValueError, match="got 1, and none for view1"):
-        evaluate(tiny_gaussians(), masked)
+    refused("got 1, and none for view1", evaluate, tiny_gaussians(), masked)
     assert not have_masks(views) and have_masks(masked[:1]) and not have_masks([])
     assert evaluate(tiny_gaussians(), masked[:1]).masked and not evaluate(tiny_gaussians(), views).masked
 

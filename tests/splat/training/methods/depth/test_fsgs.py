@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from splat.losses.cpu.loss import CpuViewLoss
-from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.loop import train
 from splat.training.methods.depth import fsgs
 from splat.training.methods.depth.fsgs import FSGS, depth_loss, unpool
 from splat.training.methods.methods import ThreeDGS
-from splat.training.state import Step, TrainConfig, Training
-from tests.splat.tiny import EXTENT, HEIGHT, WIDTH, tiny_config, tiny_gaussians, tiny_views
+from splat.training.state import Training
+from tests.splat.tiny import EXTENT, HEIGHT, WIDTH, a_step, both_of, tiny_config, tiny_gaussians, tiny_views, trained
 
 WIDE = FSGS(threshold=0.2, large=0.1)  # of the tiny scene some are sources, some not
 
@@ -23,13 +21,6 @@ WIDE = FSGS(threshold=0.2, large=0.1)  # of the tiny scene some are sources, som
 def with_depths(views: list[View]) -> list[View]:
     generator = torch.Generator().manual_seed(5)
     return [replace(view, depth=torch.rand(HEIGHT, WIDTH, generator=generator)) for view in views]
-
-
-def a_step(settings: FSGS, number: int = 1) -> Step:
-    views, config = with_depths(tiny_views(torch.float64)), TrainConfig(10, method=settings)
-    training = Training.start(tiny_gaussians(sh_degree=1, dtype=torch.float64), EXTENT, config)
-    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
-    return Step(number, training, training.gaussians, views, 1, torch.zeros(3, dtype=torch.float64), lambda _: loss)
 
 
 def edges_by_hand(means: np.ndarray, largest: np.ndarray, settings: FSGS) -> list[tuple[int, int]]:
@@ -50,10 +41,8 @@ def edges_by_hand(means: np.ndarray, largest: np.ndarray, settings: FSGS) -> lis
 @pytest.mark.parametrize("released", [False, True])
 @pytest.mark.parametrize("neighbours", [1, 3, 40])
 def test_unpooling_grows_one_gaussian_on_every_edge_of_a_distant_large_one(neighbours, released):
-    settings, gaussians = (
-        replace(WIDE, neighbours=neighbours, released=released),
-        tiny_gaussians(20, sh_degree=1, dtype=torch.float64),
-    )
+    settings = replace(WIDE, neighbours=neighbours, released=released)
+    gaussians = tiny_gaussians(20, sh_degree=1, dtype=torch.float64)
     change = unpool(gaussians, EXTENT, settings)
     means = gaussians.means.numpy()
     edges = edges_by_hand(means, gaussians.log_scales.exp().amax(dim=1).numpy(), settings)
@@ -79,9 +68,7 @@ def test_a_scene_of_one_or_two_gaussians_is_unpooled_too(n):
 
 def test_as_released_the_last_step_of_the_unpooling_is_left_out():
     config = replace(tiny_config(), method=replace(WIDE, unpool_until=6, depth_weight=0.0, released=True))
-    training = Training.start(tiny_gaussians(), EXTENT, config)
-    list(train(training, tiny_views()))
-    assert [row["step"] for row in training.method.history] == [4]
+    assert [row["step"] for row in trained(config).method.history] == [4]
 
 
 def test_unpooling_happens_at_densifications_until_its_last_step():
@@ -106,10 +93,8 @@ def test_the_depth_term_is_one_minus_the_correlation_with_the_map(kind):
         assert view.depth is not None
         values = scale * view.depth
         scaled = replace(view, depth=values)
-        candidates = [values] if kind == "depth" else [-values, 1 / (values.double() + 200)]
-        expected = 1 - max(
-            np.corrcoef(rendered.numpy().ravel(), each.double().numpy().ravel())[0, 1] for each in candidates
-        )
+        maps = [values] if kind == "depth" else [-values, 1 / (values.double() + 200)]
+        expected = 1 - max(np.corrcoef(rendered.numpy().ravel(), each.double().numpy().ravel())[0, 1] for each in maps)
         assert depth_loss(rendered, scaled, kind).item() == pytest.approx(expected, rel=1e-12)
     shifted = depth_loss(rendered, replace(view, depth=3 * values + 7), "depth")
     assert shifted.item() == pytest.approx(depth_loss(rendered, scaled, "depth").item(), rel=1e-5)  # float32 maps
@@ -124,24 +109,23 @@ def test_disparities_down_to_minus_200_are_correlated_as_they_are():
 @pytest.mark.parametrize(("number", "weight"), [(1, 0.3), (6, 0.3), (7, 0.02)])
 def test_the_gradient_is_that_of_the_loss_and_the_weighted_depth_term(number, weight):
     settings = FSGS(depth_weight=0.3, late_depth_weight=0.02, depth_until=6, depths="depth")
-    step = a_step(settings, number)
-    base = loss_and_gradient(step.gaussians, step.camera, step.loss_of(step.chosen), step.background)
-    got = step.training.method.gradient(step, base).gradient
+    step = a_step(settings, number, with_depths(tiny_views(torch.float64)))
+    base, got = both_of(step)
 
     flat = step.gaussians.flat.detach().requires_grad_()
     shown = render(step.gaussians.with_flat(flat), step.camera, depth=True, backend="reference").depth
     assert shown is not None and step.views[1].depth is not None
     both = torch.stack([shown.flatten(), step.views[1].depth.double().flatten()])
     (expected,) = torch.autograd.grad(weight * (1 - torch.corrcoef(both)[0, 1]), flat)
-    assert (got - base.gradient - expected).norm() < 1e-10 * expected.norm()
+    assert (got.gradient - base.gradient - expected).norm() < 1e-10 * expected.norm()
 
 
 def test_where_nothing_is_seen_depth_adds_nothing_and_is_not_correlated(monkeypatch):
     monkeypatch.setattr(fsgs, "depth_loss", None)
-    step = a_step(FSGS())
+    step = a_step(FSGS(), views=with_depths(tiny_views(torch.float64)))
     step.gaussians.means[:, 2] = -3.0
-    base = loss_and_gradient(step.gaussians, step.camera, step.loss_of(step.chosen), step.background)
-    assert torch.equal(step.training.method.gradient(step, base).gradient, base.gradient)
+    base, whole = both_of(step)
+    assert torch.equal(whole.gradient, base.gradient)
 
 
 def test_without_depth_maps_only_the_unpooling_can_be_trained():

@@ -11,16 +11,14 @@ from splat.render.render import render
 from splat.training.loop import train
 from splat.training.methods.dropout.dropgaussian import DropGaussian, DropGaussianMethod
 from splat.training.state import TrainConfig, Training
-from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
+from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views, trained
 
 
 @pytest.fixture
 def gains(monkeypatch) -> list[torch.Tensor]:
     """Every gain that a training draws."""
     drawn, draw = [], DropGaussianMethod.opacity_scale
-    monkeypatch.setattr(
-        DropGaussianMethod, "opacity_scale", lambda self, step: drawn.append(draw(self, step)) or drawn[-1]
-    )
+    monkeypatch.setattr(DropGaussianMethod, "opacity_scale", lambda *a: drawn.append(draw(*a)) or drawn[-1])
     return drawn
 
 
@@ -40,9 +38,7 @@ def test_the_loss_is_of_the_remaining_gaussians_with_raised_opacities(gains):
 
 def test_the_share_grows_in_proportion_to_the_step_up_to_p_max_at_the_last(gains):
     config = replace(tiny_config(6), sh_degree=0, method=DropGaussian(p_max=0.3))
-    n = 2000
-    for _ in train(Training.start(tiny_gaussians(n), EXTENT, config), tiny_views()):
-        pass
+    trained(config, tiny_gaussians(2000))
     assert len(gains) == 6
     for number, gain in enumerate(gains, start=1):
         p = 0.3 * number / 6
@@ -52,10 +48,7 @@ def test_the_share_grows_in_proportion_to_the_step_up_to_p_max_at_the_last(gains
 
 
 def test_a_gaussian_is_dropped_independently_and_anew_at_each_step(gains):
-    n = 4000
-    config = TrainConfig(2, method=DropGaussian(p_max=0.5))
-    for _ in train(Training.start(tiny_gaussians(n), EXTENT, config), tiny_views()):
-        pass
+    trained(TrainConfig(2, method=DropGaussian(p_max=0.5)), tiny_gaussians(4000))
     first, second = ((gain > 0).double() for gain in gains)
     for one, other in [(first, second), (first[1:], first[:-1])]:
         assert abs(torch.corrcoef(torch.stack([one, other]))[0, 1]) < 4 / sqrt(len(one))

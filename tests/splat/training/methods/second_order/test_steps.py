@@ -21,7 +21,7 @@ from splat.training.methods.second_order.newton_blocks import NewtonBlocks, mini
 from splat.training.methods.second_order.steps import FALLS, RISES, LocalModel, SecondOrder
 from splat.training.state import Training
 from tests.oracles import absolute_matrix
-from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
+from tests.splat.tiny import EXTENT, ended, tiny_config, tiny_gaussians, tiny_views
 
 L2, SSIM = LossSettings("l2", ssim_weight=0.0), LossSettings("l2", ssim_weight=0.3)
 GN, HESSIAN = NewtonBlocks(floor=0.3), NewtonBlocks(floor=0.3, curvature="hessian")
@@ -139,11 +139,8 @@ def steps(settings: SecondOrder, gaussians: Gaussians, count: int, fitted: bool 
     config = replace(tiny_config(count), method=settings, loss=L2, random_background=False, **changes)
     training, views = Training.start(gaussians, EXTENT, config), tiny_views()
     if fitted:
-        images = [render(training.gaussians, view.camera).image.detach() for view in views]
-        views = [replace(view, image=image) for view, image in zip(views, images, strict=True)]
-    for _ in train(training, views):
-        pass
-    return training
+        views = [replace(view, image=render(training.gaussians, view.camera).image.detach()) for view in views]
+    return ended(training, views)
 
 
 @pytest.mark.parametrize("settings", [NewtonBlocks(curvature="hessian"), GaussNewtonCG()])

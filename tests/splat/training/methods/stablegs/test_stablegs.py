@@ -1,19 +1,15 @@
-"""StableGS on the loop: its gradient against one autograd expression, what it leaves out, and resuming."""
+"""StableGS on the loop: its gradient against one autograd expression, and what it leaves out."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from landscape.errors import InputError
 from splat.curvature.traces import exact_traces
-from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
-from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training import state
-from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings
 from splat.training.loop import train
 from splat.training.methods import agreement
@@ -22,48 +18,27 @@ from splat.training.methods.stablegs import stablegs
 from splat.training.methods.stablegs.attribute_probe import Caps, Constants, ProbeSettings
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.methods.stablegs.viewpoint_probe import ViewpointSettings
-from splat.training.state import Step, TrainConfig, Training
+from splat.training.state import TrainConfig, Training
 from tests.splat.random_scenes import random_like
-from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
+from tests.splat.tiny import EXTENT, a_step, both_of, ended, tiny_config, tiny_gaussians, tiny_views, trained
 from tests.splat.training.methods.stablegs.test_attribute_probe import probed_again
 
 SMALL = Caps(0.01, 0.05, 0.05, 0.05, 0.05)  # so that no splat crosses another between the two derivatives
 PROBE = ProbeSettings(caps=SMALL)
 
 
-def first_step(settings: StableGS, **others) -> Step:
-    views = tiny_views(torch.float64)
-    gaussians = tiny_gaussians(sh_degree=1, dtype=torch.float64)
-    config = TrainConfig(5, method=settings, **others)
-    training = Training.start(gaussians, EXTENT, config)
-    training.method.on_start(training, views)
-    losses = [CpuViewLoss(view.image, config.loss, torch.float64) for view in views]
-    background = config.background_colour(torch.float64)
-    return Step(settings.warm_up + 1, training, training.gaussians, views, 1, background, losses.__getitem__)
+READINGS = [{}, {"asp_views": "all"}, {"viewpoints": "all", "vsp_gradient": "probed"}, {"viewpoints": "all"}]
 
 
-def base_of(step: Step):
-    return loss_and_gradient(step.gaussians, step.camera, step.loss_of(step.chosen), step.background)
-
-
-@pytest.mark.parametrize(
-    ("reading", "count"),
-    [
-        ({}, 1),
-        ({"viewpoints": "all"}, 3),
-        ({"asp_views": "all"}, 1),
-        ({"viewpoints": "all", "vsp_gradient": "probed"}, 3),
-        ({"vsp_share": 0.9}, 1),
-    ],
-)
-def test_the_gradient_is_that_of_the_total_loss_with_constant_probes(monkeypatch, reading, count):
+@pytest.mark.parametrize("reading", [*READINGS, {"vsp_share": 0.9}])
+def test_the_gradient_is_that_of_the_total_loss_with_constant_probes(monkeypatch, reading):
     settings = StableGS(warm_up=0, asp_weight=0.7, vsp_weight=0.3, probe=PROBE, **reading)
-    step, probes, poses = first_step(settings, background=(0.2, 0.4, 0.1)), [], []
+    step, probes, poses = a_step(settings, background=(0.2, 0.4, 0.1)), [], []
     probing, posing = stablegs.probe_attributes, stablegs.composite_pose
     monkeypatch.setattr(stablegs, "probe_attributes", lambda *a: probes.append(probing(*a)) or probes[-1])
     monkeypatch.setattr(stablegs, "composite_pose", lambda *a, **k: poses.append(posing(*a, **k)) or poses[-1])
-    gradient = step.training.method.gradient(step, base_of(step)).gradient
-    assert len(probes) == 1 and len(poses) == count
+    gradient = both_of(step)[1].gradient
+    assert len(probes) == 1 and len(poses) == (3 if "viewpoints" in reading else 1)
 
     flat = step.gaussians.flat.detach().requires_grad_()
     gaussians = step.gaussians.with_flat(flat)
@@ -89,26 +64,21 @@ def test_the_gradient_is_that_of_the_total_loss_with_constant_probes(monkeypatch
 
 
 def test_nothing_is_probed_before_the_warm_up_is_over():
-    method = StableGS(warm_up=6, every=3, probe=PROBE)
-    runs = {}
-    for name, config in {"3dgs": tiny_config(), "stablegs": replace(tiny_config(), method=method)}.items():
+    runs = []
+    for config in (tiny_config(), replace(tiny_config(), method=StableGS(warm_up=6, every=3, probe=PROBE))):
         training = Training.start(tiny_gaussians(), EXTENT, config)
-        runs[name] = [training.gaussians.flat.clone() for _ in train(training, tiny_views())]
-        if name == "stablegs":
-            assert sorted({row["step"] for row in training.method.history}) == [7, 10]
-    same = [torch.equal(*pair) for pair in zip(runs["3dgs"], runs["stablegs"], strict=True)]
+        runs.append([training.gaussians.flat.clone() for _ in train(training, tiny_views())])
+    assert sorted({row["step"] for row in training.method.history}) == [7, 10]
+    same = [torch.equal(*pair) for pair in zip(*runs, strict=True)]
     assert same == [True] * 6 + [False] * 6
 
 
 def test_a_probe_of_no_attribute_weighs_the_photometric_gradient_alone(monkeypatch):
-    def never(*_, **__):
-        raise AssertionError("was worked out for nothing")
-
-    for module, name in ((state, "loss_and_gradient"), (stablegs, "exact_traces"), (agreement, "ViewPass")):
-        monkeypatch.setattr(module, name, never)
     settings = StableGS(warm_up=0, probe=ProbeSettings(attributes=()), viewpoint=ViewpointSettings(edge_rotation=False))
-    step = first_step(settings)
-    base = base_of(step)
+    step = a_step(settings)
+    base = step.loss_and_gradient(step.gaussians)
+    for module, name in ((state, "loss_and_gradient"), (stablegs, "exact_traces"), (agreement, "ViewPass")):
+        monkeypatch.setattr(module, name, None)  # would be worked out for nothing
     torch.testing.assert_close(step.training.method.gradient(step, base).gradient, 2 * base.gradient, rtol=0, atol=0)
 
 
@@ -129,20 +99,20 @@ def test_a_loss_of_weight_0_is_not_rendered(monkeypatch, weights, renders):
         monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
     asp, vsp = weights
     viewpoint = ViewpointSettings(edge_rotation=False)
-    step = first_step(StableGS(warm_up=0, asp_weight=asp, vsp_weight=vsp, probe=PROBE, viewpoint=viewpoint))
-    base = base_of(step)
-    gradient = step.training.method.gradient(step, base).gradient
+    step = a_step(StableGS(warm_up=0, asp_weight=asp, vsp_weight=vsp, probe=PROBE, viewpoint=viewpoint))
+    base, whole = both_of(step)
+    calls["loss_and_gradient"] -= 1  # the base
     assert tuple(calls.values()) == renders
-    assert torch.equal(gradient, base.gradient) == (weights == (0.0, 0.0))
+    assert torch.equal(whole.gradient, base.gradient) == (weights == (0.0, 0.0))
 
 
 def test_a_viewpoint_that_sees_nothing_adds_nothing(monkeypatch):
-    step = first_step(StableGS(warm_up=0, asp_weight=0.0, probe=PROBE))
+    step = a_step(StableGS(warm_up=0, asp_weight=0.0, probe=PROBE))
     away = replace(step.camera, centre=torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64))
     monkeypatch.setattr(stablegs, "composite_pose", lambda *_, **__: away)
     monkeypatch.setattr(agreement, "backend_of", None)
-    base = base_of(step)
-    assert torch.equal(step.training.method.gradient(step, base).gradient, base.gradient)
+    base, whole = both_of(step)
+    assert torch.equal(whole.gradient, base.gradient)
 
 
 def test_viewpoints_that_see_nothing_are_counted_for_each_diagnosis(monkeypatch):
@@ -154,18 +124,10 @@ def test_viewpoints_that_see_nothing_are_counted_for_each_diagnosis(monkeypatch)
         return replace(pose, centre=pose.centre + 50 * pose.forward) if m else pose
 
     monkeypatch.setattr(stablegs, "composite_pose", away)
-    training = Training.start(tiny_gaussians(), EXTENT, config)
-    for _ in train(training, tiny_views()):
-        pass
-    notes = [row for row in training.method.history if "note" in row]
+    notes = [row for row in trained(config).method.history if "note" in row]
     # two of three views, at the steps 4 to 7, 8 to 11, and 12
     note = "probed viewpoints without a Gaussian in sight, until the next diagnosis"
     assert notes == [{"step": step, "note": note, "count": count} for step, count in ((4, 8), (8, 8), (12, 2))]
-
-
-def looking_away(gaussians):
-    """What the tiny views do not see; undone by a second call."""
-    gaussians.means[:, 2] *= -1
 
 
 def test_without_a_gaussian_in_sight_a_diagnosis_keeps_the_magnitudes():
@@ -177,7 +139,7 @@ def test_without_a_gaussian_in_sight_a_diagnosis_keeps_the_magnitudes():
     for done in train(training, tiny_views()):
         kept.append(dict(method.magnitudes))
         if done.step in (2, 4, 6):  # out of sight for the diagnoses of steps 3 and 7, in sight for that of step 5
-            looking_away(training.gaussians)
+            training.gaussians.means[:, 2] *= -1
     assert not any(kept[:4]) and kept[4] and all(magnitudes == kept[4] for magnitudes in kept[4:])
     found = {row["step"]: row.get("note", "") for row in method.history if "count" not in row}
     assert found == {step: "" if step == 5 else "no Gaussian in sight: magnitudes kept" for step in (3, 5, 7)}
@@ -185,10 +147,9 @@ def test_without_a_gaussian_in_sight_a_diagnosis_keeps_the_magnitudes():
 
 def test_the_history_says_what_was_negative_and_what_was_capped():
     constants = Constants(means=1e-9, opacity_logits=0.0)
-    step = first_step(StableGS(warm_up=0, probe=ProbeSettings(c=constants)))
-    method = step.training.method
-    method.gradient(step, base_of(step))
-    rows = {row["attribute"]: row for row in method.history}
+    step = a_step(StableGS(warm_up=0, probe=ProbeSettings(c=constants)))
+    both_of(step)
+    rows = {row["attribute"]: row for row in step.training.method.history}
     assert set(rows) == {"means", "log_scales", "quats", "sh"}
     for row in rows.values():
         assert row["step"] == 1 and row["standard_error"] > 0
@@ -200,8 +161,7 @@ def test_the_history_says_what_was_negative_and_what_was_capped():
 def test_the_papers_samples_and_the_exact_traces_estimate_the_same():
     values = {}
     for traces in ("exact", "paper"):
-        step = first_step(StableGS(warm_up=0, traces=traces))
-        step.training.method.gradient(step, base_of(step))
+        both_of(step := a_step(StableGS(warm_up=0, traces=traces)))
         values[traces] = {row["attribute"]: row for row in step.training.method.history}
     for name, exact in values["exact"].items():
         paper = values["paper"][name]
@@ -212,8 +172,8 @@ def test_the_papers_samples_and_the_exact_traces_estimate_the_same():
 
 def contributions(settings: StableGS, draws: int) -> torch.Tensor:
     """What the method adds to the gradient of one view, (draws, p), after the diagnosis and a pair of probes."""
-    step = first_step(settings)
-    base, method = base_of(step), step.training.method
+    step = a_step(settings)
+    base, method = step.loss_and_gradient(step.gaussians), step.training.method
     later = replace(step, number=step.number + 1)
     found = [method.gradient(each, base).gradient - base.gradient for each in (step, *[later] * (draws + 1))]
     return torch.stack(found[2:])
@@ -222,38 +182,28 @@ def contributions(settings: StableGS, draws: int) -> torch.Tensor:
 def test_what_makes_it_cheaper_leaves_the_expectation_of_the_gradient():
     """The mean over draws along 20 fixed directions, within four standard errors of that without any of it."""
     plain = StableGS(warm_up=0, viewpoints="all", antithetic=False, probe=PROBE)
-    directions = random_like((20, first_step(plain).gaussians.flat.numel()), 0).T
+    directions = random_like((20, a_step(plain).gaussians.flat.numel()), 0).T
     directions /= directions.norm(dim=0)
     means, variances = {}, {}
-    for name, changed in {
-        "plain": {},
-        "one": {"viewpoints": "one"},
-        "antithetic": {"antithetic": True},
-        "share": {"vsp_share": 0.25},
-    }.items():
+    cheaper = {"one": {"viewpoints": "one"}, "antithetic": {"antithetic": True}, "share": {"vsp_share": 0.25}}
+    for name, changed in {"plain": {}, **cheaper}.items():
         along = contributions(replace(plain, **changed), 100) @ directions
         pairs = (along[::2] + along[1::2]) / 2  # of opposite probes, independent of one another
         means[name], variances[name] = pairs.mean(dim=0), pairs.var(dim=0) / len(pairs)
     assert float((means["plain"].abs() / variances["plain"].sqrt()).max()) > 20  # so that a wrong weight would be seen
-    for name in ("one", "antithetic", "share"):
+    for name in cheaper:
         error = (variances[name] + variances["plain"]).sqrt()
         assert ((means[name] - means["plain"]).abs() < 4 * error).all(), name
 
 
 def test_two_steps_share_the_numbers_of_a_probe_with_opposite_signs(monkeypatch):
-    step, signs, drawn = first_step(StableGS(warm_up=0, probe=PROBE)), [], []
-    probing = stablegs.probe_attributes
-    monkeypatch.setattr(
-        stablegs, "probe_attributes", lambda *a: signs.append(a[-1]) or drawn.append(a[-2]) or probing(*a)
-    )
-    base, method = base_of(step), step.training.method
-    for _ in range(4):
-        method.gradient(step, base)
+    step, seen, probing = a_step(StableGS(warm_up=0, probe=PROBE)), [], stablegs.probe_attributes
+    monkeypatch.setattr(stablegs, "probe_attributes", lambda *a: seen.append(a[-2:]) or probing(*a))
     grown = step.gaussians.select(torch.arange(13) % 12)
-    for gaussians in (step.gaussians, grown):  # of another number the numbers are new
-        one = replace(step, gaussians=gaussians)
-        method.gradient(one, base_of(one))
-    assert signs == [1, -1, 1, -1, 1, 1]
+    for gaussians in [step.gaussians] * 5 + [grown]:  # of another number the numbers are new
+        both_of(replace(step, gaussians=gaussians))
+    drawn, signs = zip(*seen, strict=True)
+    assert list(signs) == [1, -1, 1, -1, 1, 1]
     assert drawn[0] is drawn[1] and drawn[2] is drawn[3]
     assert not torch.equal(drawn[0]["sh"], drawn[2]["sh"]) and len(drawn[5]["sh"]) == 13
 
@@ -263,10 +213,9 @@ def test_between_the_sampled_diagnoses_the_traces_follow_their_exact_part(monkey
     exact, carried = stablegs.exact_traces, stablegs.carried_traces
     monkeypatch.setattr(stablegs, "exact_traces", lambda *a, **k: sampled.append(exact(*a, **k)) or sampled[-1])
     monkeypatch.setattr(stablegs, "carried_traces", lambda *a: found.append(carried(*a)) or found[-1])
-    step = first_step(StableGS(warm_up=0, every=1, sampled_every=3, asp_weight=0.0, vsp_weight=0.1, probe=PROBE))
-    base = base_of(step)
+    step = a_step(StableGS(warm_up=0, every=1, sampled_every=3, asp_weight=0.0, vsp_weight=0.1, probe=PROBE))
     for number in range(1, 8):
-        step.training.method.gradient(replace(step, number=number), base)
+        both_of(replace(step, number=number))
     assert len(sampled) == 3 and len(found) == 4  # the first of every three
     for name, trace in found[0].items():
         # the Gaussians did not move: the same value and error, to round-off
@@ -274,24 +223,6 @@ def test_between_the_sampled_diagnoses_the_traces_follow_their_exact_part(monkey
         assert trace.standard_error == pytest.approx(sampled[0][name].standard_error, rel=1e-9) and trace.probes == 0
     rows = [row for row in step.training.method.history if row["attribute"] == "sh"]
     assert [row["samples"] > 0 for row in rows] == [True, False, False] * 2 + [True]
-
-
-def test_a_stablegs_run_continues_from_a_checkpoint_to_the_same_bits(tmp_path: Path):
-    config = replace(tiny_config(), method=StableGS(warm_up=3, every=4))
-    whole = Training.start(tiny_gaussians(), EXTENT, config)
-    for _ in train(whole, tiny_views()):
-        pass
-    part, path = Training.start(tiny_gaussians(), EXTENT, config), tmp_path / "checkpoint.pt"
-    for done in train(part, tiny_views()):
-        if done.step == 6:
-            break
-    save_checkpoint(path, part, REFERENCE)
-    resumed = load_checkpoint(path).training
-    assert resumed.config == config
-    for _ in train(resumed, tiny_views()):
-        pass
-    assert torch.equal(resumed.gaussians.flat, whole.gaussians.flat)
-    assert resumed.method.history == whole.method.history
 
 
 def rounds(config: TrainConfig) -> list[int]:
@@ -324,16 +255,13 @@ def test_densification_can_wait_for_the_end_of_the_warm_up(monkeypatch):
     short = replace(tiny_config(), method=StableGS(warm_up=5, every=4, probe=PROBE, densify_after_warm_up=True))
     training, made = Training.start(tiny_gaussians(), EXTENT, short), []
     monkeypatch.setattr(training.method, "on_densify", lambda change: made.append(training.step + 1))
-    for _ in train(training, tiny_views()):
-        pass
+    ended(training)
     assert made == rounds(short) == [6, 8]
 
 
 def test_a_training_in_which_it_never_acts_is_refused():
     training = Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=StableGS(warm_up=12)))
-    with pytest.raises(
-        InputError, match=r"got stablegs which never does in 12 steps \(warm_up = 12\); take more steps"
-    ):
+    with pytest.raises(InputError, match=r"got stablegs which never does in 12 steps \(warm_up = 12\); take more"):
         next(train(training, tiny_views()))
     assert training.step == 0
 
