@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from splat.model.settings import RenderSettings
+from tests.refusals import refused
 
 
 def test_defaults_are_those_of_the_original_rasterizer():
@@ -34,5 +35,4 @@ def test_a_pixel_in_float32_stops_at_the_threshold_itself():
     ],
 )
 def test_thresholds_out_of_range_are_refused(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        RenderSettings(**wrong)
+    refused(message, RenderSettings, **wrong)

@@ -4,6 +4,7 @@ Poses are held as camera-to-world columns (right, down, forward) and centres, an
 """
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,9 +46,7 @@ def poses() -> list[Pose]:
     return result
 
 
-def write_pictures(
-    folder: Path, names: tuple[str, ...] = NAMES, size: tuple[int, int] = SIZE, channels: int = 3
-) -> None:
+def write_pictures(folder: Path, names: tuple[str, ...] = NAMES, size: tuple[int, int] = SIZE, channels=3) -> None:
     """Pictures of noise, a different one for each name."""
     folder.mkdir(parents=True, exist_ok=True)
     random = np.random.default_rng(0)
@@ -59,9 +58,8 @@ def write_pictures(
 def reconstruction(model: str = "PINHOLE", params: tuple[float, ...] = (*FOCAL, *CENTRE)) -> pycolmap.Reconstruction:
     """The COLMAP model of the three cameras; 2-D observations are exact for PINHOLE."""
     result = pycolmap.Reconstruction()
-    result.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model=model, width=SIZE[0], height=SIZE[1], params=list(params))
-    )
+    camera = pycolmap.Camera(camera_id=1, model=model, width=SIZE[0], height=SIZE[1], params=list(params))
+    result.add_camera_with_trivial_rig(camera)
     slots = {}
     for i, (name, pose) in enumerate(zip(NAMES, poses())):
         mine = [p for p, images in enumerate(SEEN) if i in images]
@@ -77,9 +75,7 @@ def reconstruction(model: str = "PINHOLE", params: tuple[float, ...] = (*FOCAL, 
     return result
 
 
-def write_colmap(
-    folder: Path, text: bool = False, at: str = "sparse/0", model: pycolmap.Reconstruction | None = None
-) -> None:
+def write_colmap(folder: Path, text=False, at="sparse/0", model: pycolmap.Reconstruction | None = None) -> None:
     (folder / at).mkdir(parents=True)
     model = model or reconstruction()
     (model.write_text if text else model.write_binary)(folder / at)
@@ -116,14 +112,21 @@ def write_transforms(folder: Path, **top: object) -> None:
     (folder / "transforms.json").write_text(json.dumps(transforms(**top)))
 
 
+def rewrite(folder: Path, change: Callable[[dict[str, Any]], object], **top: object) -> None:
+    """A transforms scene whose file is changed."""
+    write_transforms(folder, **top)
+    content = json.loads((folder / "transforms.json").read_text())
+    change(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
 def write_blender(folder: Path, train: tuple[int, ...], test: tuple[int, ...], channels: int = 4) -> None:
     """transforms_train.json and transforms_test.json with files r_ID.png; the poses repeat."""
     for subset, numbers in (("train", train), ("test", test)):
         names = tuple(f"{subset}/r_{k}.png" for k in numbers)
         write_pictures(folder, names, channels=channels)
-        frames = [
-            {"file_path": f"./{name[:-4]}", "transform_matrix": opengl(poses()[i % 3])} for i, name in enumerate(names)
-        ]
+        turns = [opengl(pose) for pose in poses()] * len(names)
+        frames = [{"file_path": f"./{name[:-4]}", "transform_matrix": turn} for name, turn in zip(names, turns)]
         (folder / f"transforms_{subset}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
 
 

@@ -14,6 +14,7 @@ from splat.scenes.scene import Scene, load_scene
 from splat.scenes.synthetic import SyntheticScene, SyntheticSettings, synthetic_scene
 from splat.scenes.view import Frame, View, inside_image
 from splat.scenes.write import write_transforms_scene
+from tests.refusals import refused
 
 SMALL = SyntheticSettings(gaussians=120, views=4, width=40, height=30)
 
@@ -87,8 +88,7 @@ def test_points_behind_another_surface_are_not_seen(small: SyntheticScene) -> No
     "settings", [{"gaussians": 10}, {"views": 1}, {"width": 4}, {"arc": 200.0}, {"point_share": 0.0}]
 )
 def test_settings_that_make_no_scene_are_refused(settings: dict) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        SyntheticSettings(**settings)
+    refused("expected", SyntheticSettings, **settings)
 
 
 def test_a_written_scene_is_found_again(small: SyntheticScene, tmp_path: Path) -> None:
@@ -139,8 +139,7 @@ def test_a_scene_is_written_whole_or_not_at_all(small: SyntheticScene, tmp_path:
 
 
 def test_an_existing_folder_is_not_overwritten(small: SyntheticScene, tmp_path: Path) -> None:
-    with pytest.raises(FileExistsError, match="does not exist yet"):
-        write_transforms_scene(small.scene, tmp_path)
+    refused("does not exist yet", write_transforms_scene, small.scene, tmp_path, error=FileExistsError)
 
 
 def test_the_truth_has_the_size_asked_for() -> None:

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from landscape.errors import InputError
 from splat.model.files.read import is_foreign, read_cfg_args, read_splats
 from splat.model.files.splat_ply import splat_ply
 from splat.model.files.tensor_files import gsplat_bytes, load_tensors
 from splat.projection.antialias import baked
+from tests.refusals import refused
 from tests.splat.model.files import written
 from tests.splat.model.files.written import FILES, columns, ply, scene
 
@@ -94,19 +94,15 @@ def test_the_ranks_of_gsplat_concatenate_in_their_order(tmp_path):
         stored(tmp_path, f"ckpt_10_rank{rank}.pt", written.gsplat_pt(part, 10))
     stored(tmp_path, "ckpt_5_rank0.pt", written.gsplat_pt(scene(), 5))
     assert torch.equal(read_splats(tmp_path / "ckpt_10_rank0.pt").gaussians.flat, whole.flat)
-    with pytest.raises(InputError, match=r"name the first, ckpt_10_rank0\.pt"):
-        read_splats(tmp_path / "ckpt_10_rank1.pt")
+    refused(r"name the first, ckpt_10_rank0\.pt", read_splats, tmp_path / "ckpt_10_rank1.pt")
     stored(tmp_path, "ckpt_10_rank01.pt", written.gsplat_pt(scene(), 10))
-    with pytest.raises(InputError, match="ranks are 0, 1, 2, 3, one of them twice"):
-        read_splats(tmp_path / "ckpt_10_rank0.pt")
+    refused("ranks are 0, 1, 2, 3, one of them twice", read_splats, tmp_path / "ckpt_10_rank0.pt")
     (tmp_path / "ckpt_10_rank01.pt").unlink()
     share = (tmp_path / "ckpt_10_rank1.pt").rename(tmp_path / "elsewhere.pt")
-    with pytest.raises(InputError, match="ranks are 0, 2, 3, without 1: a share of the scene is missing"):
-        read_splats(tmp_path / "ckpt_10_rank0.pt")
+    refused("ranks are 0, 2, 3, without 1: a share of the scene is missing", read_splats, tmp_path / "ckpt_10_rank0.pt")
     share.rename(tmp_path / "ckpt_10_rank1.pt")
     stored(tmp_path, "ckpt_10_rank2.pt", written.gsplat_pt(scene(), 11))
-    with pytest.raises(InputError, match="another step"):
-        read_splats(tmp_path / "ckpt_10_rank0.pt")
+    refused("another step", read_splats, tmp_path / "ckpt_10_rank0.pt")
 
 
 def test_bands_that_graphdeco_had_not_reached_are_left_out(tmp_path):
@@ -127,14 +123,10 @@ def test_a_splatfacto_that_was_wrapped_for_several_gpus_or_compiled_is_read(tmp_
     assert torch.equal(found.flat, scene().flat)
 
 
-FITTED = [
-    "_model.camera_optimizer.pose_adjustment",
-    "_model.module.bil_grids.grids",
-    "datamanager.train_camera_optimizer.pose",
-]
+FITTED = ("_model.camera_optimizer.pose_adjustment", "_model.module.bil_grids.grids")
 
 
-@pytest.mark.parametrize("name", FITTED)
+@pytest.mark.parametrize("name", [*FITTED, "datamanager.train_camera_optimizer.pose"])
 def test_what_splatfacto_fitted_beside_gaussians_is_said_where_it_is_not_zero(tmp_path, name):
     content = load_tensors(written.splatfacto(scene()))
     for fitted, count in ((torch.zeros(3, 6), 0), (torch.ones(3, 6), 1)):
@@ -143,12 +135,8 @@ def test_what_splatfacto_fitted_beside_gaussians_is_said_where_it_is_not_zero(tm
         assert [note.endswith("is not applied") for note in notes] == [True] * count
 
 
-INFINITE = {
-    "a.ply": written.columns,
-    "b.pth": written.graphdeco_pth,
-    "ckpt_1.pt": written.gsplat_pt,
-    "c.ckpt": written.splatfacto,
-}
+INFINITE = {"a.ply": columns, "b.pth": written.graphdeco_pth, "ckpt_1.pt": written.gsplat_pt}
+INFINITE["c.ckpt"] = written.splatfacto
 
 
 @pytest.mark.parametrize("name", INFINITE)
@@ -175,19 +163,15 @@ def coloured(kind: str, name: str, white: float) -> bytes:
     rows = np.zeros(3, [(k, "<f4") for k in kept] + [(k, "<" + kind) for k in ("red", "green", "blue")])
     for column, values in {**kept, **dict.fromkeys(("red", "green", "blue"), white * np.array([1, 0.2, 0]))}.items():
         rows[column] = values
-    head = [
-        f"property {name if rows.dtype[k].str[1:] == kind and k not in kept else 'float'} {k}"
-        for k in rows.dtype.names or ()
-    ]
-    return (
-        "\n".join(["ply", "format binary_little_endian 1.0", "element vertex 3", *head, "end_header\n"]).encode()
-        + rows.tobytes()
-    )
+    head = [f"property {'float' if k in kept else name} {k}" for k in rows.dtype.names or ()]
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 3", *head, "end_header\n"]
+    return "\n".join(head).encode() + rows.tobytes()
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "white"), [("u1", "uchar", 255), ("u2", "ushort", 65535), ("f4", "float", 1), ("f8", "double", 1)]
-)
+WHITES = [("u1", "uchar", 255), ("u2", "ushort", 65535), ("f4", "float", 1), ("f8", "double", 1)]
+
+
+@pytest.mark.parametrize(("kind", "name", "white"), WHITES)
 def test_white_is_that_of_the_kind_of_colours(tmp_path, kind, name, white):
     found = read_splats(stored(tmp_path, "a.ply", coloured(kind, name, white)))
     colours = 0.5 + found.gaussians.sh[:, 0] / (4 * np.pi) ** 0.5
@@ -197,22 +181,16 @@ def test_white_is_that_of_the_kind_of_colours(tmp_path, kind, name, white):
 
 @pytest.mark.parametrize(("kind", "name", "white"), [("i4", "int", 255), ("f4", "float", 255), ("i2", "short", -1)])
 def test_colours_whose_white_is_not_known_are_refused(tmp_path, kind, name, white):
-    with pytest.raises(InputError, match="not known which one is white"):
-        read_splats(stored(tmp_path, "a.ply", coloured(kind, name, white)))
+    refused("not known which one is white", read_splats, stored(tmp_path, "a.ply", coloured(kind, name, white)))
 
 
-@pytest.mark.parametrize(
-    ("thing", "named"),
-    [
-        (Path("/a"), "pathlib.PosixPath"),
-        (datetime(2020, 1, 1), "datetime.datetime"),
-        (Fraction(1, 2), "fractions.Fraction"),
-    ],
-)
+THINGS = [(Path("/a"), "pathlib.PosixPath"), (datetime(2020, 1, 1), "datetime.datetime")]
+
+
+@pytest.mark.parametrize(("thing", "named"), [*THINGS, (Fraction(1, 2), "fractions.Fraction")])
 def test_objects_beside_the_tensors_are_named_without_torchs_advice(tmp_path, thing, named):
     path = stored(tmp_path, "ckpt_1_rank0.pt", written.saved({"step": 1, "splats": {}, "more": thing}))
-    with pytest.raises(InputError, match=f"more than tensors and numbers: a {named}; save it again without that$"):
-        read_splats(path)
+    refused(f"more than tensors and numbers: a {named}; save it again without that$", read_splats, path)
 
 
 def test_mip_splattings_filter_is_kept_and_baked_as_its_own_exporter_does(tmp_path):
@@ -232,11 +210,7 @@ def test_mip_splattings_filter_is_kept_and_baked_as_its_own_exporter_does(tmp_pa
     assert found.tool == "mip-splatting" and found.antialiased and not found.extra
 
 
-@pytest.mark.parametrize(
-    ("settings", "line"),
-    [("cfg.yml", "antialiased"), ("config.yml", "    rasterize_mode")],
-    ids=["gsplat", "nerfstudio"],
-)
+@pytest.mark.parametrize(("settings", "line"), [("cfg.yml", "antialiased"), ("config.yml", "    rasterize_mode")])
 def test_a_line_of_the_trainers_settings_says_that_it_was_antialiased(tmp_path, settings, line):
     path = stored(tmp_path, "ckpts/ckpt_6_rank0.pt", written.gsplat_pt(scene()))
     for word, said in (("true" if settings == "cfg.yml" else "antialiased", True), ("false", False)):
@@ -253,9 +227,7 @@ def test_graphdecos_settings_are_read_beside_the_model_and_never_run(tmp_path):
     assert found.settings == {"sh_degree": 3, "eval": True, "antialiasing": True, "source_path": "/data/a"}
 
 
-@pytest.mark.parametrize(
-    "text", ["__import__('os').system('false')", "Namespace(**{'a': 1})", "(" * 5000, "x" * 70_000, ""]
-)
+@pytest.mark.parametrize("text", ["__import__('os')", "Namespace(**{'a': 1})", "(" * 5000, "x" * 70_000, ""])
 def test_settings_that_are_no_namespace_of_literals_are_no_settings(tmp_path, text):
     assert read_cfg_args(stored(tmp_path, "cfg_args", text.encode())) == {}
 
@@ -292,9 +264,7 @@ def with_rest(count: int) -> bytes:
     ids=lambda value: None if isinstance(value, bytes) else value[:20],
 )
 def test_what_cannot_be_rendered_is_refused_in_a_sentence(tmp_path, content, message):
-    with pytest.raises(InputError, match=message) as caught:
-        read_splats(stored(tmp_path, "file", content))
-    assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
+    assert str(tmp_path) in refused(message, read_splats, stored(tmp_path, "file", content))
 
 
 def test_members_that_share_their_bytes_are_no_more_than_the_file_may_hold(tmp_path):
@@ -304,8 +274,7 @@ def test_members_that_share_their_bytes_are_no_more_than_the_file_may_hold(tmp_p
         for i in range(100):
             archive.filelist.append(copy(archive.filelist[0]))
             archive.filelist[-1].filename = f"a/data/{i}"
-    with pytest.raises(InputError, match=r"promises 101,000,000 bytes"):
-        load_tensors(buffer.getvalue())
+    refused(r"promises 101,000,000 bytes", load_tensors, buffer.getvalue())
     assert not is_foreign(stored(tmp_path, "bomb.pt", buffer.getvalue()))
 
 
@@ -320,6 +289,5 @@ class Trap:
 def test_a_file_that_would_run_code_is_refused(tmp_path):
     touched = tmp_path / "ran-code"
     path = stored(tmp_path, "ckpt.pt", written.saved({"step": 1, "splats": Trap(touched)}))
-    with pytest.raises(InputError, match="more than tensors"):
-        read_splats(path)
+    refused("more than tensors", read_splats, path)
     assert not touched.exists()

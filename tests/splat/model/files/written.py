@@ -33,9 +33,8 @@ def ply(columns: dict[str, np.ndarray], comments: tuple[str, ...] = (), order: s
     n, name = len(next(iter(columns.values()))), {"f4": "float", "f8": "double"}[kind]
     body = np.stack(list(columns.values()), axis=1).astype(order + kind)
     form = {"<": "binary_little_endian", ">": "binary_big_endian", "": "ascii"}[order]
-    rows = (
-        body.tobytes() if order else "\n".join(" ".join(repr(float(x)) for x in row) for row in body).encode() + b"\n"
-    )
+    text = "".join(" ".join(repr(float(x)) for x in row) + "\n" for row in body)
+    rows = body.tobytes() if order else text.encode()
     header = f"ply\nformat {form} 1.0\n" + "".join(f"comment {c}\n" for c in comments) + f"element vertex {n}\n"
     return (header + "".join(f"property {name} {c}\n" for c in columns) + "end_header\n").encode() + rows
 
@@ -57,9 +56,8 @@ def brush(gaussians: Gaussians) -> bytes:
     found = columns(gaussians, normals=False)
     rank = {name: i for i, name in enumerate(("scale", "opacity", "rot", "f_dc", "f_rest"))}
     order = sorted(found, key=lambda name: rank.get(name.rpartition("_")[0] or name, -1))
-    return ply(
-        {name: found[name] for name in order}, ("Exported from Brush", "SH degree: 3", "SplatRenderMode: default")
-    )
+    comments = ("Exported from Brush", "SH degree: 3", "SplatRenderMode: default")
+    return ply({name: found[name] for name in order}, comments)
 
 
 def saved(content: object) -> bytes:
@@ -81,35 +79,21 @@ def graphdeco_pth(gaussians: Gaussians, active: int = 3) -> bytes:
 
 
 def gsplat_pt(gaussians: Gaussians, step: int = 6999) -> bytes:
-    a = gaussians.attributes
-    splats = torch.nn.ParameterDict(
-        {
-            "means": a["means"].clone(),
-            "scales": a["log_scales"].clone(),
-            "quats": a["quats"].clone(),
-            "opacities": a["opacity_logits"].clone(),
-            "sh0": a["sh"][:, :1].clone(),
-            "shN": a["sh"][:, 1:].clone(),
-        }
-    )
+    g = gaussians
+    named = {"means": g.means, "scales": g.log_scales, "quats": g.quats, "opacities": g.opacity_logits}
+    named |= {"sh0": g.sh[:, :1], "shN": g.sh[:, 1:]}
+    splats = torch.nn.ParameterDict({name: value.clone() for name, value in named.items()})
     return saved({"step": step, "splats": splats.state_dict()})
 
 
 def splatfacto(gaussians: Gaussians, prefix: str = "_model.gauss_params.") -> bytes:
-    a = gaussians.attributes
-    named = {
-        "means": a["means"],
-        "scales": a["log_scales"],
-        "quats": a["quats"],
-        "features_dc": a["sh"][:, 0],
-        "features_rest": a["sh"][:, 1:],
-        "opacities": a["opacity_logits"][:, None],
-    }
+    g = gaussians
+    named = {"means": g.means, "scales": g.log_scales, "quats": g.quats, "opacities": g.opacity_logits[:, None]}
+    named |= {"features_dc": g.sh[:, 0], "features_rest": g.sh[:, 1:]}
     pipeline = OrderedDict((prefix + name, value.clone()) for name, value in named.items())
     pipeline["_model.lpips.net.weight"] = torch.zeros(3)
-    return saved(
-        {"step": 29999, "pipeline": pipeline, "schedulers": {"means": {"last_lr": [np.float64(1e-6)]}}, "scalers": {}}
-    )
+    schedulers = {"means": {"last_lr": [np.float64(1e-6)]}}
+    return saved({"step": 29999, "pipeline": pipeline, "schedulers": schedulers, "scalers": {}})
 
 
 def dot_splat(gaussians: Gaussians) -> bytes:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from splat.scenes.scene import load_scene
+from tests.refusals import refused
 from tests.splat.scenes import folders
 from tests.splat.scenes.folders import FOCAL, NAMES, SIZE, intrinsics, require_poses
 
@@ -21,59 +22,53 @@ def test_llff_cameras_and_depth_ranges_come_back(tmp_path: Path) -> None:
     assert [frame.depth_range for frame in scene.frames] == [(2.0, 4.5)] * 3
 
 
-@pytest.mark.parametrize("rows", [np.zeros((3, 15)), np.full((3, 17), np.nan), np.zeros(17)])
-def test_llff_poses_of_another_shape_are_refused(tmp_path: Path, rows: np.ndarray) -> None:
+def test_llff_files_that_are_no_arrays_of_poses_or_hold_objects_are_refused(tmp_path: Path) -> None:
     folders.write_pictures(tmp_path / "images")
-    np.save(tmp_path / "poses_bounds.npy", rows)
-    with pytest.raises(ValueError, match="finite rows of 17 numbers"):
-        load_scene(tmp_path)
+    path = tmp_path / "poses_bounds.npy"
+    for rows in (np.zeros((3, 15)), np.full((3, 17), np.nan), np.zeros(17)):
+        np.save(path, rows)
+        refused("finite rows of 17 numbers", load_scene, tmp_path)
+    np.save(path, np.array([{}], dtype=object), allow_pickle=True)
+    refused("cannot read it", load_scene, tmp_path)
+    np.save(path, np.zeros((3, 17), dtype=complex))
+    refused("cannot read it: an array of complex128", load_scene, tmp_path)
+    np.save(path, np.zeros((3, 17)))
+    whole = path.read_bytes()
+    cut, large = whole.replace(b"(3, 17)", b"(3, 17 "), whole.replace(b"(3,", b"(10**15,")
+    for damaged in (cut, large, b"PK\x03\x04" + whole, b"not an array"):
+        path.write_bytes(damaged)
+        refused("cannot read it", load_scene, tmp_path)
 
 
-def test_llff_files_that_are_no_arrays_or_hold_objects_are_refused(tmp_path: Path) -> None:
-    folders.write_pictures(tmp_path / "images")
-    (tmp_path / "poses_bounds.npy").write_bytes(b"not an array")
-    with pytest.raises(ValueError, match="cannot read it"):
-        load_scene(tmp_path)
-    np.save(tmp_path / "poses_bounds.npy", np.array([{}], dtype=object), allow_pickle=True)
-    with pytest.raises(ValueError, match="cannot read it"):
-        load_scene(tmp_path)
-    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17), dtype=complex))
-    with pytest.raises(ValueError, match="cannot read it: an array of complex128"):
-        load_scene(tmp_path)
-    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))
-    whole = (tmp_path / "poses_bounds.npy").read_bytes()
-    for damaged in (whole.replace(b"(3, 17)", b"(3, 17 "), whole.replace(b"(3,", b"(10**15,"), b"PK\x03\x04" + whole):
-        (tmp_path / "poses_bounds.npy").write_bytes(damaged)
-        with pytest.raises(ValueError, match="cannot read it"):
-            load_scene(tmp_path)
+SIDE = "'b.png' cannot be: expected at least 1 px a side"
+BOUNDS = slice(15, None)
 
 
-@pytest.mark.parametrize(("column", "value"), [(4, 0.0), (9, -24.0), (9, 1e300)])
-def test_llff_sizes_that_cannot_be_are_refused(tmp_path: Path, column: int, value: float) -> None:
+@pytest.mark.parametrize(
+    ("columns", "value", "words"),
+    [
+        (4, 0.0, SIDE),
+        (9, -24.0, SIDE),
+        (9, 1e300, SIDE),
+        (BOUNDS, (4.5, 2.0), "got 4.5 and 2 for 'b.png'"),
+        (BOUNDS, (-1.0, 4.5), "got -1 and 4.5 for 'b.png'"),
+        (BOUNDS, (0.0, 4.5), "got 0 and 4.5 for 'b.png'"),
+        (BOUNDS, (2.0, 2.0), "got 2 and 2 for 'b.png'"),
+    ],
+)
+def test_llff_sizes_and_depth_ranges_that_cannot_be_are_refused(tmp_path: Path, columns, value, words: str) -> None:
     folders.write_llff(tmp_path)
     rows = np.load(tmp_path / "poses_bounds.npy")
-    rows[1, column] = value
+    rows[1, columns] = value
     np.save(tmp_path / "poses_bounds.npy", rows)
-    with pytest.raises(ValueError, match=r"'b.png' cannot be: expected at least 1 px a side"):
-        load_scene(tmp_path)
-
-
-@pytest.mark.parametrize("bounds", [(4.5, 2.0), (-1.0, 4.5), (0.0, 4.5), (2.0, 2.0)])
-def test_llff_depth_ranges_that_cannot_be_are_refused(tmp_path: Path, bounds: tuple[float, float]) -> None:
-    folders.write_llff(tmp_path)
-    rows = np.load(tmp_path / "poses_bounds.npy")
-    rows[1, 15:] = bounds
-    np.save(tmp_path / "poses_bounds.npy", rows)
-    found = rf"{tmp_path}/poses_bounds.npy, got {bounds[0]:g} and {bounds[1]:g} for 'b.png'"
-    with pytest.raises(ValueError, match=f"expected 0 < nearest < farthest depth .* {found}"):
-        load_scene(tmp_path)
+    start = "" if words == SIDE else f"expected 0 < nearest < farthest depth .* {tmp_path}/poses_bounds.npy, "
+    refused(start + words, load_scene, tmp_path)
 
 
 def test_llff_needs_an_image_for_each_pose(tmp_path: Path) -> None:
     folders.write_llff(tmp_path)
     (tmp_path / "images/b.png").unlink()
-    with pytest.raises(ValueError, match=r"each of the 3 poses .* got 2"):
-        load_scene(tmp_path)
+    refused(r"each of the 3 poses .* got 2", load_scene, tmp_path)
 
 
 def test_fern_has_the_same_cameras_in_both_of_its_formats(fern: Path, tmp_path: Path) -> None:
