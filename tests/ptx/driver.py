@@ -52,10 +52,8 @@ def _run_by_the_machine(kernel: Any) -> None:
 
     constants = [(i,) in kernel.src.constants for i in range(len(kernel.src.fn.arg_names))]
 
-    def run(
-        x: int, y: int, z: int, _stream: Any, _function: Any, _packed: Any, _launch: Any, *hooks_and_all: Any
-    ) -> None:
-        arguments = [a for a, constant in zip(hooks_and_all[2:], constants, strict=True) if not constant]
+    def run(x: int, y: int, z: int, *told: Any) -> None:  # stream, function, metadata twice, two hooks, arguments
+        arguments = [a for a, constant in zip(told[6:], constants, strict=True) if not constant]
         about = kernel.metadata
         machine.launch(kernel.asm["ptx"], (x, y, z), about.num_warps, about.shared, arguments)
 

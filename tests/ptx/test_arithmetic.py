@@ -45,22 +45,15 @@ def test_nan_is_neither_less_nor_equal_and_conversions_saturate():
     assert of("setp.nan.f64", nan, 1) == [True] and of("setp.lt.u32", 1, 2**32 - 1) == [True]
     assert of("min.f32", nan, 1) == [1.0] and of("max.f64", 2, nan) == [2.0]
     assert of("cvt.rzi.s32.f64", [1e30, -1e30, nan, -2.7]) == [2**31 - 1, -(2**31), 0, -2]
-    assert (
-        of("cvt.rmi.f64.f64", -0.5) == [-1.0]
-        and of("cvt.s64.s32", -1) == [-1]
-        and of("cvt.u64.u32", 2**32 - 1) == [2**32 - 1]
-    )
+    assert of("cvt.rmi.f64.f64", -0.5) == [-1.0] and of("cvt.s64.s32", -1) == [-1]
+    assert of("cvt.u64.u32", 2**32 - 1) == [2**32 - 1]
 
 
 def test_whole_numbers_wrap_and_divide_towards_zero():
     assert of("mul.lo.s32", 2**30, 6) == [-(2**31)] and of("mul.wide.s32", 2**30, 6) == [6 * 2**30]
     assert of("div.s32", -7, 2) == [-3] and of("rem.s32", -7, 2) == [-1]
-    assert (
-        of("bfe.u32", 0b110100, 2, 3) == [0b101]
-        and of("bfe.s32", 0b110100, 2, 4) == [-3]
-        and of("shr.s32", -8, 1) == [-4]
-        and of("shr.u32", 2**31, 31) == [1]
-    )
+    assert of("bfe.u32", 0b110100, 2, 3) == [0b101] and of("bfe.s32", 0b110100, 2, 4) == [-3]
+    assert of("shr.s32", -8, 1) == [-4] and of("shr.u32", 2**31, 31) == [1]
     assert number("0d3FF0000000000000", "f64") == 1.0 and number("0xff", "b16") == 255
 
 

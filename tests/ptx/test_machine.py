@@ -77,9 +77,8 @@ def test_a_block_has_its_own_shared_memory_and_waits_for_its_warps():
     mad.wide.u32 %rd2, %r3, 4, %rd1;
     st.global.b32 [ %rd2 + 0 ], { %r7 };
     """
-    assert run(body, ints(128), blocks=2, warps=2, shared=256) == [63 - i for i in range(64)] + [
-        64 - i for i in range(64)
-    ]
+    expected = [63 - i for i in range(64)] + [64 - i for i in range(64)]
+    assert run(body, ints(128), blocks=2, warps=2, shared=256) == expected
 
 
 def test_sums_are_atomic_over_all_blocks():

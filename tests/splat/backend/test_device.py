@@ -6,6 +6,7 @@ import torch
 from landscape.errors import InputError
 from splat.backend.device import device_named
 from splat.render.backend import CPU, backend_of
+from tests.refusals import refused
 
 
 def test_the_cpu_is_the_cpu_and_has_kernels_of_its_own():
@@ -31,10 +32,7 @@ def test_a_gpu_that_cannot_be_used_is_one_clear_sentence_or_the_cpu_where_that_i
     monkeypatch.setattr(torch.version, "cuda", cuda)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: available)
     monkeypatch.setattr("splat.backend.device.find_spec", lambda name: object() if triton else None)
-    with pytest.raises(
-        ValueError, match=rf"^expected an NVIDIA GPU for the device cuda, {lack}.*, or use the device cpu$"
-    ):
-        device_named("cuda")
+    refused(rf"^expected an NVIDIA GPU for the device cuda, {lack}.*, or use .* cpu$", device_named, "cuda")
     assert device_named("auto") == torch.device("cpu")
 
 
@@ -62,10 +60,7 @@ def test_each_of_a_machines_processes_takes_a_gpu_of_its_own_and_too_few_are_one
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
     for rank in range(3):  # also in those that would find one, lest the others wait for them
         monkeypatch.setenv("LOCAL_RANK", str(rank))
-        with pytest.raises(
-            ValueError, match=r"^expected .* cuda, got 2 for the 3 processes of this machine; start torchrun"
-        ):
-            device_named("cuda")
+        refused(r"^expected .* cuda, got 2 for the 3 processes of this machine; start", device_named, "cuda")
         assert device_named("auto") == torch.device("cpu")
 
 

@@ -120,9 +120,8 @@ def objective(device: torch.device, views: int, memory: int = 2**30) -> SceneObj
     """For a machine without a GPU: one tile a view, and a loss without SSIM."""
     gaussians = random_gaussians(4, 0, logit=1.0, spread=0.4)
     gaussians = gaussians.with_flat(gaussians.flat.to(device))
-    return SceneObjective(
-        gaussians, two_views(12, 8)[:views], LossSettings("charbonnier", 0.0), BACKGROUND, memory=memory
-    )
+    loss = LossSettings("charbonnier", 0.0)
+    return SceneObjective(gaussians, two_views(12, 8)[:views], loss, BACKGROUND, memory=memory)
 
 
 @pytest.mark.parametrize("gauss_newton", [False, True])
@@ -141,9 +140,8 @@ def test_recorded_products_of_a_scene_equal_others_to_the_last_bit(device, monke
         warnings.simplefilter("error", UserWarning)
         for seed in (1, 2):
             V = random_like((hessian.dim, 2), seed).to(device)
-            assert torch.equal(
-                hessian.apply(V), hessian.project(hessian.views.apply(hessian.projector.without_lengths(V)))
-            )
+            product = hessian.views.apply(hessian.projector.without_lengths(V))
+            assert torch.equal(hessian.apply(V), hessian.project(product))
     assert fake is None or fake.replays == 2
 
 

@@ -17,7 +17,7 @@ from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
-from splat.model.settings import Antialias, RenderSettings
+from splat.model.settings import RenderSettings
 from splat.render.render import render
 from splat.scenes.view import View
 from tests.splat.random_scenes import ANTIALIASED, MODES, filtered, random_camera, random_gaussians, random_like
@@ -83,9 +83,7 @@ def geometry_rows(objective: SceneObjective) -> Tensor:
     ids=str,
 )
 @pytest.mark.parametrize("gauss_newton", [False, True])
-def test_own_blocks_are_those_of_the_dense_hessian(
-    loss: LossSettings, sh_degree: int, mode: Antialias, gauss_newton: bool
-) -> None:
+def test_own_blocks_are_those_of_the_dense_hessian(loss, sh_degree, mode, gauss_newton):
     gaussians = filtered(awkward_gaussians(sh_degree), mode)
     objective = objective_of(gaussians, loss, noise=0.3, size=(33, 27), settings=MODES[mode])
     own = objective.block_diagonal(gauss_newton=gauss_newton)
@@ -198,9 +196,7 @@ def test_traces_of_sums_over_pixels_are_exact(loss: LossSettings, gauss_newton: 
     [(0.02, False, False), (0.5, False, False), (0.5, False, True), (0.5, True, False), (0.02, True, True)],
     ids=["near a fit", "far from a fit", "in units", "Gauss-Newton", "Gauss-Newton, in units"],
 )
-def test_traces_with_ssim_are_within_their_errors_over_many_seeds(
-    noise: float, gauss_newton: bool, scaled: bool
-) -> None:
+def test_traces_with_ssim_are_within_their_errors_over_many_seeds(noise: float, gauss_newton: bool, scaled: bool):
     objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise)
     scale = units_of(objective) if scaled else None
     diagonal = dense(SceneHessian(objective, gauss_newton=gauss_newton)).diagonal()

@@ -20,20 +20,9 @@ from splat.render.render import render
 from splat.scenes.view import View
 from tests.oracles import central_difference
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, mean_loss, two_views
-from tests.splat.random_scenes import (
-    ANTIALIASED,
-    DERIVATIVE,
-    DTYPES,
-    IMAGE,
-    MODES,
-    NUMPY,
-    errors_by_block,
-    filtered,
-    random_gaussians,
-    random_like,
-    relative_error,
-)
+from tests.splat.random_scenes import ANTIALIASED, MODES, filtered, random_gaussians, random_like
 from tests.splat.tiny import SMOOTH
+from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, NUMPY, errors_by_block, relative_error
 
 LOSSES = [
     LossSettings(),

@@ -11,7 +11,8 @@ from splat.curvature.traces import block_traces, exact_traces
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, mean_loss, two_views
-from tests.splat.random_scenes import errors_by_block, random_gaussians, random_like, relative_error
+from tests.splat.random_scenes import random_gaussians, random_like
+from tests.splat.tolerances import errors_by_block, relative_error
 
 BOTH = LossSettings("charbonnier", opacity_reg=0.7, scale_reg=0.4)
 EACH = [BOTH, LossSettings(opacity_reg=0.7), LossSettings("l2", ssim_weight=0, scale_reg=0.4)]

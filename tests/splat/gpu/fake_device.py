@@ -97,9 +97,8 @@ class FakeDevice(TorchDispatchMode):
         if brought or (name == "copy_" and self._label(args[0]) == GPU and self._label(args[1]) == HOST):
             self.brought[name] += 1
         made = func(*args, **kwargs)
-        unknown = (
-            self._named.found or torch._C._current_graph_task_id() >= 0
-        )  # in a backward pass functions are not seen
+        # in a backward pass functions are not seen
+        unknown = self._named.found or torch._C._current_graph_task_id() >= 0
         by_name = EITHER if EITHER in labels or (not inputs and unknown) else HOST
         for each in tree_leaves(made):
             if isinstance(each, Tensor) and self._label(each) is None:

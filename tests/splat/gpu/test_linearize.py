@@ -15,20 +15,12 @@ from splat.model.settings import RenderSettings
 from splat.render.backend import backend_of
 from splat.render.render import Backend, render
 from splat.scenes.view import View
-from splat.training.loop import train
 from splat.training.state import Training
 from tests.splat.gpu.emulated import emulate
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, two_views
-from tests.splat.random_scenes import (
-    DERIVATIVE,
-    MODES,
-    errors_by_block,
-    filtered,
-    random_gaussians,
-    random_like,
-    relative_error,
-)
-from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
+from tests.splat.random_scenes import MODES, filtered, random_gaussians, random_like
+from tests.splat.tiny import EXTENT, ended, tiny_config, tiny_gaussians, tiny_views
+from tests.splat.tolerances import DERIVATIVE, errors_by_block, relative_error
 
 LOSS = LossSettings("charbonnier")
 
@@ -85,17 +77,9 @@ def test_all_that_a_view_on_the_gpu_gives_is_what_one_on_the_cpu_gives(device, m
         held = LinearizedView(gaussians, view.camera, loss, BACKGROUND, RenderSettings())
         own, coarse = (held.block_diagonal(gauss_newton=part, approximate=True) for part in (False, True))
         u = U.to(gaussians.flat)
-        found = [
-            held.image,
-            held.gradient,
-            held.jvp(u),
-            held.vjp(G.to(u)),
-            held.hvp(u),
-            held.ggn(u),
-            own.geometry,
-            own.sh,
-        ]
-        return [each.cpu() for each in (*found, coarse.geometry, coarse.sh, *held.loss_curvatures(u))]
+        found = [held.image, held.gradient, held.jvp(u), held.vjp(G.to(u)), held.hvp(u), held.ggn(u)]
+        found += [own.geometry, own.sh, coarse.geometry, coarse.sh, *held.loss_curvatures(u)]
+        return [each.cpu() for each in found]
 
     expected = everything(gaussians)
     emulate(monkeypatch, device.type == "cpu")
@@ -137,16 +121,11 @@ def test_images_on_the_gpu_are_twice_differentiable(gpu):
 
 
 def test_a_training_on_the_gpu_takes_the_steps_of_one_on_the_cpu(device, monkeypatch):
-    def trained(at: torch.device) -> Training:
-        training = Training.start(tiny_gaussians(dtype=torch.float64), EXTENT, tiny_config(3))
-        training.move(at)
-        for _ in train(training, tiny_views(torch.float64)):
-            pass
-        return training
-
-    expected = trained(torch.device("cpu"))
+    expected, found = (Training.start(tiny_gaussians(dtype=torch.float64), EXTENT, tiny_config(3)) for _ in range(2))
+    ended(expected, tiny_views(torch.float64))
     emulate(monkeypatch, device.type == "cpu")
-    found = trained(device)
+    found.move(device)
+    ended(found, tiny_views(torch.float64))
     assert len(found.gaussians) == len(expected.gaussians) and found.adam.updates == expected.adam.updates == 3
     # Adam divides by the gradient's own size, so that what is next to 0 keeps few digits
     assert relative_error(found.gaussians.flat.cpu(), expected.gaussians.flat) < 1e-9

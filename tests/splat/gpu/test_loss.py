@@ -11,7 +11,8 @@ from splat.losses.reference import LossSettings, photometric_loss
 from splat.render.backend import backend_of
 from tests.splat.gpu.emulated import emulate
 from tests.splat.losses.test_losses import SETTINGS, image_and_target, truth, truth_of_both
-from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, random_like, relative_error
+from tests.splat.random_scenes import random_like
+from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, relative_error
 
 SINGLE, DOUBLE = DTYPES
 CASES = [

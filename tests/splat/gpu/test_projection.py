@@ -15,18 +15,8 @@ from splat.projection.formulas import lens_of
 from splat.projection.reference import project as specified
 from splat.projection.whitening import COEFFICIENTS, MOMENTS, PLAIN_GRADIENT, PLAIN_TANGENT
 from tests.splat.projection.test_projection import SPLAT_BLOCKS, N, camera_and_gaussians, settings_of, truth
-from tests.splat.random_scenes import (
-    ANTIALIASED,
-    DERIVATIVE,
-    DTYPES,
-    IMAGE,
-    MODES,
-    errors_by_block,
-    random_camera,
-    random_gaussians,
-    random_like,
-    relative_error,
-)
+from tests.splat.random_scenes import ANTIALIASED, MODES, random_camera, random_gaussians, random_like
+from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, errors_by_block, relative_error
 
 each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
 

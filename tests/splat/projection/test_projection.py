@@ -26,20 +26,8 @@ from tests.oracles import (
     splat_in_many_digits,
     splat_of_gaussian,
 )
-from tests.splat.random_scenes import (
-    ANTIALIASED,
-    DERIVATIVE,
-    DTYPES,
-    IMAGE,
-    MODES,
-    NUMPY,
-    errors_by_block,
-    filtered,
-    random_camera,
-    random_gaussians,
-    random_like,
-    relative_error,
-)
+from tests.splat.random_scenes import ANTIALIASED, MODES, filtered, random_camera, random_gaussians, random_like
+from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, NUMPY, errors_by_block, relative_error
 
 N, K, SETTINGS = 80, 3, RenderSettings(fov_clamp=0.9)
 SPLAT_BLOCKS = {"means": slice(0, 2), "conics": slice(2, 5), "opacities": slice(5, 6), "colours": slice(6, 9)}

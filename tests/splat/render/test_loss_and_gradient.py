@@ -10,7 +10,8 @@ from splat.render.backend import backend_of
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from tests.splat.held_scenes import BACKGROUND, two_views
-from tests.splat.random_scenes import DTYPES, filtered, random_gaussians
+from tests.splat.random_scenes import filtered, random_gaussians
+from tests.splat.tolerances import DTYPES
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)

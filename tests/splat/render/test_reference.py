@@ -11,8 +11,9 @@ from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.render.render import Rendering, render
 from tests.oracles import composited_picture, splat_of_gaussian
-from tests.splat.random_scenes import random_camera, random_gaussians, relative_error
+from tests.splat.random_scenes import random_camera, random_gaussians
 from tests.splat.tiny import SMOOTH
+from tests.splat.tolerances import relative_error
 
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
 

@@ -13,16 +13,9 @@ from splat.model.settings import RenderSettings
 from splat.render.forward import rasterize_view
 from splat.render.render import Backend, render, render_depth
 from tests.splat.held_scenes import BACKGROUND
-from tests.splat.random_scenes import (
-    DERIVATIVE,
-    IMAGE,
-    errors_by_block,
-    random_camera,
-    random_gaussians,
-    random_like,
-    relative_error,
-)
+from tests.splat.random_scenes import random_camera, random_gaussians, random_like
 from tests.splat.tiny import SMOOTH
+from tests.splat.tolerances import DERIVATIVE, IMAGE, errors_by_block, relative_error
 
 SIZES = [(48, 40), (1, 40), (40, 1), (7, 9)]
 

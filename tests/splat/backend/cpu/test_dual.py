@@ -7,7 +7,7 @@ import torch
 
 from splat.backend.cpu.dual import DIRECTIONS, dual, exp, sqrt, tangent_of, value_of, variable
 from splat.backend.cpu.simd import store
-from tests.splat.random_scenes import DTYPES, NUMPY
+from tests.splat.tolerances import DTYPES, NUMPY
 
 
 def formula(x, y, root, power):

@@ -14,7 +14,8 @@ from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.render.render import render
 from tests.splat.held_scenes import BACKGROUND, two_views
-from tests.splat.random_scenes import DTYPES, random_gaussians, random_like
+from tests.splat.random_scenes import random_gaussians, random_like
+from tests.splat.tolerances import DTYPES
 
 
 @pytest.fixture

@@ -24,9 +24,7 @@ def objective() -> SceneObjective:
 
 @pytest.mark.parametrize("metric", ["parameters", "optimiser"])
 @pytest.mark.parametrize("gauss_newton", [False, True])
-def test_projectors_have_their_ranks_and_leave_nothing_out_that_is_curved(
-    objective: SceneObjective, gauss_newton: bool, metric: str
-) -> None:
+def test_projectors_have_their_ranks_and_leave_nothing_out_that_is_curved(objective, gauss_newton, metric):
     hessian = SceneHessian(objective, gauss_newton=gauss_newton)
     scale = None if metric == "parameters" else optimiser_units(objective, LearningRates(), extent=3.0)
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
@@ -47,9 +45,7 @@ def test_projectors_have_their_ranks_and_leave_nothing_out_that_is_curved(
 
 
 @pytest.mark.parametrize("gauss_newton", [False, True])
-def test_the_indices_of_every_attribute_are_those_of_its_dense_block(
-    objective: SceneObjective, gauss_newton: bool
-) -> None:
+def test_the_indices_of_every_attribute_are_those_of_its_dense_block(objective: SceneObjective, gauss_newton: bool):
     hessian = SceneHessian(objective, gauss_newton=gauss_newton)
     H = hessian.apply(torch.eye(hessian.dim, dtype=torch.float64))
     runs, misses, spaces = 6, Counter(), active_spaces(objective, hessian.projector)

@@ -88,9 +88,7 @@ def test_gauss_newton_loses_nothing_by_the_projection(views: int, sh_degree: int
 
 
 @each_case
-def test_the_rank_is_that_of_the_stacked_jacobians_and_within_bounds(
-    views: int, sh_degree: int, mode: Antialias
-) -> None:
+def test_the_rank_is_that_of_the_stacked_jacobians_and_within_bounds(views: int, sh_degree: int, mode: Antialias):
     objective = objective_of(views, sh_degree, mode=mode)
     operator, n, k = SceneHessian(objective, gauss_newton=True), len(objective.active), (sh_degree + 1) ** 2
     total = 0
@@ -216,9 +214,7 @@ def test_what_is_seen_whole_is_left_as_it_is_bit_for_bit() -> None:
 
 
 @pytest.mark.parametrize(("rows", "columns", "copies"), [(8, 16, 0), (36, 16, 0), (40, 35, 1)])
-def test_a_gpu_takes_no_large_matrices_apart(
-    monkeypatch: pytest.MonkeyPatch, rows: int, columns: int, copies: int
-) -> None:
+def test_a_gpu_takes_no_large_matrices_apart(monkeypatch: pytest.MonkeyPatch, rows: int, columns: int, copies: int):
     generator = torch.Generator().manual_seed(0)
     A = torch.randn(CHUNK + 3, rows, 5, generator=generator, dtype=torch.float64)
     A = A @ torch.randn(CHUNK + 3, 5, columns, generator=generator, dtype=torch.float64)  # of rank 5

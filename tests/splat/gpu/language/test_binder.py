@@ -84,11 +84,10 @@ def zeros(make: Any) -> Any:
 
 
 def kernels() -> list[str]:
-    """The names of those that the tests of the compiler know, but for the bench's."""
-    from tests.splat.gpu.language import test_kernels_compile as others
-    from tests.splat.gpu.raster import test_compiles as raster
+    """The names of those that the test of the compiler knows."""
+    from tests.splat.gpu.test_compiles import others, rasterizer
 
-    return sorted({kernel.__name__ for kernel, *_ in raster.kernels() + others.kernels()} - {"multiply_add"})
+    return sorted({kernel.__name__ for kernel, *_ in rasterizer() + others()})
 
 
 if __name__ == "__main__":

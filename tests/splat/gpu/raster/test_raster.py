@@ -17,8 +17,8 @@ from splat.render import autograd as functions
 from splat.render.backend import plain_gradient
 from splat.render.formulas import SPLAT
 from tests.splat.gpu.emulated import emulate
-from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, relative_error
 from tests.splat.render.compositing_cases import BACKGROUND, BLOCKS, CASES, TINY, plain_jvp, plain_product, truth
+from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, relative_error
 
 ALL = torch.cuda.is_available() or "LANDSCAPE_ALL_CASES" in os.environ  # ten minutes without a GPU
 each_case = pytest.mark.parametrize("name", [*CASES, *TINY] if ALL else TINY)
@@ -40,22 +40,18 @@ class Results:
     curvature: Tensor
 
 
-def raster_of(
-    name: str, dtype: torch.dtype, device: torch.device, accumulation: Accumulation = "deterministic"
-) -> CudaRaster:
+def raster_of(name: str, dtype: torch.dtype, device: torch.device, how: Accumulation = "deterministic") -> CudaRaster:
     expected = truth(name)
     splats, depths = expected.splats.to(device), expected.depths.to(device, dtype)
-    settings = replace(expected.case.settings, accumulation=accumulation)
+    settings = replace(expected.case.settings, accumulation=how)
     drawn, background = expected.drawn.to(device), BACKGROUND.to(device)
     return CudaRaster(splats, depths, drawn, background, *expected.case.size, settings)
 
 
 @cache
-def results(
-    name: str, dtype: torch.dtype, device: torch.device, accumulation: Accumulation = "deterministic"
-) -> Results:
+def results(name: str, dtype: torch.dtype, device: torch.device, how: Accumulation = "deterministic") -> Results:
     expected, K = truth(name), vectors(name)
-    raster = raster_of(name, dtype, device, accumulation)
+    raster = raster_of(name, dtype, device, how)
     adjoint = raster.backward(expected.G.to(device))
     tangent = plain_jvp(raster, expected.U[:, :K].to(device))
     product = plain_product(raster, tangent, adjoint, expected.dG[:K].to(device))
@@ -110,7 +106,7 @@ def test_the_cases_stop_pixels_leave_intersections_unreached_and_reach_the_cap(d
 
 @pytest.mark.parametrize("name", [*CASES, *TINY] if ALL else ["tiny equal depths"])
 def test_atomic_accumulation_differs_from_deterministic_by_round_off(name, device):
-    one, other = results(name, torch.float64, device), results(name, torch.float64, device, accumulation="atomic")
+    one, other = results(name, torch.float64, device), results(name, torch.float64, device, how="atomic")
     assert torch.equal(one.raster.planes, other.raster.planes) and torch.equal(one.jvp, other.jvp)
     assert relative_error(one.gradient, other.gradient) < 1e-14
     assert relative_error(one.curvature, other.curvature) < 1e-13
@@ -165,10 +161,8 @@ def test_nothing_drawn_is_the_background_and_has_no_derivative(dtype, device):
 
 def test_tiles_with_a_cotangent_of_zero_add_nothing(device):
     expected, raster = truth("tiny equal depths"), raster_of("tiny equal depths", torch.float64, device)
-    tangent, whole = (
-        plain_jvp(raster, expected.U[:, :1].to(device)),
-        results("tiny equal depths", torch.float64, device),
-    )
+    tangent = plain_jvp(raster, expected.U[:, :1].to(device))
+    whole = results("tiny equal depths", torch.float64, device)
     lit = torch.zeros(raster.height, raster.width, device=device, dtype=torch.float64)
     lit[:, :16] = 1  # the first of two tiles
     gradients, products = [], []
@@ -240,9 +234,8 @@ def test_as_a_torch_function_it_has_the_derivatives_of_the_cpu(device, monkeypat
         emulate(monkeypatch, emulated)
         parts = [part.to(where).requires_grad_() for part in splats.split((2, 3, 1, 3), dim=1)]
         shown = Splats(parts[0], parts[1], parts[2][:, 0], parts[3], *(tensor.to(where) for tensor in drawn))
-        image, alpha = functions.rasterize_by_kernel(
-            shown, BACKGROUND.to(where), *expected.case.size, expected.case.settings
-        )
+        about = BACKGROUND.to(where), *expected.case.size, expected.case.settings
+        image, alpha = functions.rasterize_by_kernel(shown, *about)
         loss = image.square().sum() + (alpha * image[0]).sum()
         gradient = torch.cat(torch.autograd.grad(loss, parts, create_graph=True), dim=1)
         product = torch.autograd.grad((gradient * expected.U[:, 0].to(where)).sum(), parts)

@@ -9,8 +9,8 @@ from splat.backend.cpu.simd import lanes_of
 from splat.model.settings import RenderSettings
 from splat.render.cpu.binning import bin_splats, depth_order, heaviest_first, radix_argsort
 from splat.render.formulas import thresholds_of
-from tests.splat.random_scenes import DTYPES, NUMPY
 from tests.splat.render.compositing_cases import CASES, truth
+from tests.splat.tolerances import DTYPES, NUMPY
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

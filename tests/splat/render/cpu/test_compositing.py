@@ -11,8 +11,8 @@ from splat.model.settings import RenderSettings
 from splat.render.backend import plain_gradient
 from splat.render.cpu.raster import CpuRaster
 from tests.oracles import central_difference
-from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, NUMPY, relative_error
 from tests.splat.render.compositing_cases import BLOCKS, CASES, plain_jvp, plain_product, truth
+from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, NUMPY, relative_error
 
 each_case = pytest.mark.parametrize("name", CASES)
 each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
