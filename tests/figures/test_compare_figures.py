@@ -85,9 +85,8 @@ def test_a_side_of_which_only_ends_are_known_says_so(tmp_path):
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "end of the spectrum"]
     record.data.eigenvalues.max.value = record.data.eigenvalues.min.value = None
     figure = draw_densities({"one": record})
-    assert [text.get_text() for text in figure.axes[0].texts] == ["none found"] and len(
-        figure.legends[0].get_texts()
-    ) == 1
+    assert [text.get_text() for text in figure.axes[0].texts] == ["none found"]
+    assert len(figure.legends[0].get_texts()) == 1
 
 
 def test_the_numbers_along_the_steps_of_sections_stay_apart(tmp_path):
@@ -111,10 +110,8 @@ def test_a_run_without_slice_or_density_is_in_the_other_pictures(tmp_path):
     poor.data.slice = None
     assert len([axes for axes in draw_slices(both).axes if axes.get_title(loc="left")]) == 1
     for draw in (draw_sections, draw_densities, draw_traces):
-        figure = draw(both)
-        assert [text.get_text() for text in figure.legends[0].get_texts()][:2] == [
-            label.replace("$", r"\$") for label in both
-        ]
+        said = [text.get_text() for text in draw(both).legends[0].get_texts()]
+        assert said[:2] == [label.replace("$", r"\$") for label in both]
     colours = {line.get_color() for line in draw_sections(both).axes[0].lines}
     assert colours == {RUNS[0]}
 

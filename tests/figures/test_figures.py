@@ -21,6 +21,7 @@ from figures.render_surface import Box
 from figures.style import BLACK, COLUMN, SKY, save, style
 from landscape.errors import TooLittleMemory
 from tests.recorded import synthetic, written
+from tests.refusals import refused
 
 POINT = 1 / 72  # inches
 BOX = Box(np.array([1.0, -1.55, 1.35]))
@@ -34,9 +35,8 @@ def test_a_png_is_what_matplotlib_saves_and_takes_one_drawing(tmp_path, monkeypa
     draw = figure.draw
     monkeypatch.setattr(figure, "draw", lambda renderer: drawings.append(renderer) or draw(renderer))
     drawn, saved = (Image.open(path) for path in (save(figure, tmp_path / "traces.png"), tmp_path / "saved.png"))
-    assert (
-        np.array_equal(np.asarray(drawn), np.asarray(saved.convert("RGB"))) and drawn.info["dpi"] == saved.info["dpi"]
-    )
+    assert np.array_equal(np.asarray(drawn), np.asarray(saved.convert("RGB")))
+    assert drawn.info["dpi"] == saved.info["dpi"]
     assert len(drawings) == 1
 
 
@@ -67,9 +67,7 @@ def require_layout(figure):
     assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
     assert drawn.x1 <= COLUMN + POINT and drawn.y1 <= figure.get_figheight() + POINT
     boxes = words(figure, renderer)
-    pairs = [
-        (a, b) for i, (a, box) in enumerate(boxes) for b, other in boxes[:i] if box.shrunk(0.9, 0.9).overlaps(other)
-    ]
+    pairs = [(a, b) for i, (a, box) in enumerate(boxes) for b, near in boxes[:i] if box.shrunk(0.9, 0.9).overlaps(near)]
     assert pairs == []
 
 
@@ -193,22 +191,20 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     data["slice"]["interpolation_error"] = 0.004
     record = written(tmp_path / "probe", data, arrays)
     figure = slice2d.draw(record)
-    dots = {
-        line.get_color(): len(np.asarray(line.get_xdata())) for line in figure.axes[0].lines if line.get_marker() == "."
-    }
+    drawn = [line for line in figure.axes[0].lines if line.get_marker() == "."]
+    dots = {line.get_color(): len(np.asarray(line.get_xdata())) for line in drawn}
     assert dots == {BLACK: 3 * 5, SKY: 2 * 5}
     said = " ".join(text for text, _ in words(figure, laid_out(figure)))
     assert "dots: rendered (7%),\nline: interpolated (error <0.4%)" in said and "order changed:\n10 of 25" in said
     sections = [axes for axes in figure.axes if "step along" in axes.get_xlabel()]
-    along = [
-        [len(np.asarray(line.get_xdata())) for line in axes.lines if line.get_marker() == "."] for axes in sections
-    ]
+    along = [[len(np.asarray(x.get_xdata())) for x in axes.lines if x.get_marker() == "."] for axes in sections]
     assert [3, 2] in along  # the crossed ones apart
 
 
-@pytest.mark.parametrize(
-    ("lowest", "said"), [((10, 8), "lowest at the checkpoint, the cross"), ((4, 2), "down by at most 0.500, at (")]
-)
+LOWEST = [((10, 8), "lowest at the checkpoint, the cross"), ((4, 2), "down by at most 0.500, at (")]
+
+
+@pytest.mark.parametrize(("lowest", "said"), LOWEST)
 def test_the_title_of_a_plane_says_where_it_is_lowest(tmp_path, lowest, said):
     data, arrays = synthetic()
     loss = np.full((21, 17), data["slice"]["center_loss"])
@@ -238,8 +234,7 @@ def test_a_plane_of_too_few_renders_is_drawn_as_its_sections_with_the_command_th
     for axes, count in zip(figure.axes[:2], (21, 17), strict=True):
         curve = next(line for line in axes.lines if line.get_linestyle() == "-" and line.get_color() == BLACK)
         assert np.isfinite(np.asarray(curve.get_ydata(), float)).sum() == count
-    with pytest.raises(ValueError, match=r"landscape slice .* renders more"):
-        surface.draw(record)
+    refused(r"landscape slice .* renders more", surface.draw, record)
     assert "surface.png" not in [path.name for path in make_all.draw_probe(record.folder)]
 
 
@@ -248,16 +243,14 @@ def test_a_missing_slice_is_said_and_the_other_figures_are_drawn(tmp_path):
     del arrays["slice"]
     record = written(tmp_path / "probe", data | {"slice": None}, arrays)
     for module in (slice2d, surface):
-        with pytest.raises(ValueError, match="expected a recorded slice"):
-            module.draw(record)
+        refused("expected a recorded slice", module.draw, record)
     assert [path.name for path in make_all.draw_probe(record.folder)] == ["traces.png", "spectrum.png"]
 
 
 def test_a_slice_without_a_finite_point_is_refused(tmp_path):
     data, arrays = synthetic()
     arrays["slice"]["loss"][:] = math.nan
-    with pytest.raises(ValueError, match="expected finite losses"):
-        slice2d.draw(written(tmp_path / "probe", data, arrays))
+    refused("expected finite losses", slice2d.draw, written(tmp_path / "probe", data, arrays))
 
 
 def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypatch):
@@ -330,9 +323,7 @@ def test_pyvista_renders_the_field_where_the_labels_are_put(tmp_path):
 def test_a_figure_from_the_command_line_and_its_refusal(tmp_path):
     folder = written(tmp_path / "probe", *synthetic()).folder
     good, bad = (
-        subprocess.run(
-            [sys.executable, "-m", "figures.traces", str(place)], capture_output=True, text=True, check=False
-        )
+        subprocess.run([sys.executable, "-m", "figures.traces", str(place)], capture_output=True, text=True)
         for place in (folder, tmp_path)
     )
     assert good.returncode == 0 and good.stdout.strip() == str(folder / "traces.png")

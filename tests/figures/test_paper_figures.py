@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from matplotlib.colors import to_hex
 from PIL import Image
 
-from analysis.records.records import SliceRecord, read_record, record_folder, write_record
+from analysis.records.records import Record, SliceRecord, read_record, record_folder, write_record
 from figures import fig1, fig7
 from figures.manifold import Scale, landscape_of, start_of
 from figures.scripts import runs_script
@@ -27,6 +28,13 @@ def slice_at(run: Path, scale: float) -> None:
     data, arrays = synthetic(scale)
     with record_folder(run / "slice-eigenvectors-2d", SliceRecord.FILE) as folder:
         write_record(folder, slice_of(data), {"slice": arrays["slice"]})
+
+
+def rewrite(folder: Path, change: Callable[[Record], object]) -> None:
+    record = read_record(folder)
+    change(record)
+    with record_folder(folder, SliceRecord.FILE) as anew:
+        write_record(anew, record.data, record.arrays)
 
 
 @pytest.fixture
@@ -58,11 +66,8 @@ def test_stored_records_need_no_checkpoint(runs):
 
 def test_contours_have_the_ticks_of_the_sections(runs):
     for run, reach in zip(runs, (0.0532, 0.1005), strict=True):
-        record = read_record(run / "slice-eigenvectors-2d")
-        for axis in "xy":
-            record.arrays["slice"][axis] *= reach / record.arrays["slice"][axis].max()
-        with record_folder(run / "slice-eigenvectors-2d", SliceRecord.FILE) as anew:
-            write_record(anew, record.data, record.arrays)
+        steps = {axis: value * reach / value.max() for axis, value in synthetic()[1]["slice"].items() if axis in "xy"}
+        rewrite(run / "slice-eigenvectors-2d", lambda record, steps=steps: record.arrays["slice"].update(steps))
     figure = fig1.draw(runs)
     laid_out(figure)
     first, second = figure.axes[:2]
@@ -92,11 +97,8 @@ def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
 
 def test_a_start_that_slopes_down_is_not_cut_off_at_the_ends_own_limits(runs):
     folder = runs[0] / "start" / "slice-eigenvectors-2d"
-    record = read_record(folder)
-    x = record.arrays["slice"]["x"]
-    record.arrays["slice"]["loss"][:] = record.data.slice.center_loss - 2e-2 * (x / x.max())[:, None]
-    with record_folder(folder, SliceRecord.FILE) as anew:
-        write_record(anew, record.data, record.arrays)
+    down = np.linspace(1, -1, 21)[:, None] * np.full(17, 2e-2)
+    rewrite(folder, lambda record: record.arrays["slice"].update(loss=record.data.slice.center_loss + down))
     along_e1 = fig7.draw(runs).axes[-2]
     start, *_ = (np.asarray(line.get_ydata(), float) for line in along_e1.lines)
     assert along_e1.get_ylim()[0] <= np.nanmin(start) < 0
@@ -157,15 +159,9 @@ def test_the_index_is_the_recorded_one_of_each_run(runs):
         ("objective", "background", [0, 0, 0], [1, 1, 1], "same background"),
     ],
 )
-def test_landscapes_of_different_functions_are_not_drawn_beside_each_other(
-    runs, module, section, key, first, second, words
-):
+def test_landscapes_of_different_functions_are_not_drawn_together(runs, module, section, key, first, second, words):
     def recorded(run: Path, value: object) -> None:
-        folder = run / "slice-eigenvectors-2d"
-        record = read_record(folder)
-        setattr(getattr(record.data, section), key, value)
-        with record_folder(folder, SliceRecord.FILE) as anew:
-            write_record(anew, record.data, record.arrays)
+        rewrite(run / "slice-eigenvectors-2d", lambda record: setattr(getattr(record.data, section), key, value))
 
     recorded(runs[0], first)
     recorded(runs[1], None)

@@ -10,6 +10,7 @@ from figures import make_all, slice1d, slice2d
 from figures.style import BLACK, BLUE, SKY, VERMILION
 from tests.figures.test_figures import require_layout
 from tests.recorded import synthetic, synthetic_line, written
+from tests.refusals import refused
 
 
 def difficult(case):
@@ -74,14 +75,11 @@ def test_a_value_that_is_hardly_known_does_not_flatten_the_others(tmp_path):
 def test_a_line_has_one_figure_and_a_plane_is_asked_for_elsewhere(tmp_path):
     record = written(tmp_path / "slice", *synthetic_line())
     assert [path.name for path in make_all.draw_probe(record.folder)] == ["slice1d.png"]
-    with pytest.raises(ValueError, match="got one along a line"):
-        slice2d.draw(record)
+    refused("got one along a line", slice2d.draw, record)
 
 
 def test_without_a_line_or_a_finite_loss_it_says_so(tmp_path):
     data, arrays = synthetic_line()
     arrays["slice"]["loss"][:] = math.nan
-    with pytest.raises(ValueError, match="expected finite losses"):
-        slice1d.draw(written(tmp_path / "slice", data, arrays))
-    with pytest.raises(ValueError, match="expected a slice along a line"):
-        slice1d.draw(written(tmp_path / "plane", *synthetic()))
+    refused("expected finite losses", slice1d.draw, written(tmp_path / "slice", data, arrays))
+    refused("expected a slice along a line", slice1d.draw, written(tmp_path / "plane", *synthetic()))

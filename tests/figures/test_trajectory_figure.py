@@ -29,22 +29,13 @@ def rows(scale: float = 1.0, steps: int = 4) -> pd.DataFrame:
             value = scale * (10.0 ** (i + j) if j % 2 else i - 2.5)
             row |= {f"trace_{name}": value, f"trace_{name}_error": 0.1 * abs(value)}
             row |= {f"trace_{name}_low": value - 0.2 * abs(value), f"trace_{name}_high": value + 0.2 * abs(value)}
-        row |= {
-            "lambda_max": scale * i,
-            "lambda_max_error": 0.1 * scale,
-            "lambda_min": -scale / i,
-            "lambda_min_error": 0.0,
-        }
-        row |= {
-            "eigenvalue_ratio": -float(i * i),
-            "eigenvalue_ratio_low": -1.1 * i * i,
-            "eigenvalue_ratio_high": -0.9 * i * i,
-        }
-        row |= {
-            "participation_ratio": 10.0 * i,
-            "participation_ratio_low": 5.0 * i,
-            "participation_ratio_high": math.nan,
-        }
+        row |= {"lambda_max": scale * i, "lambda_max_error": 0.1 * scale, "lambda_min": -scale / i}
+        row["lambda_min_error"] = 0.0
+        for name, value, low, high in (
+            ("eigenvalue_ratio", -float(i * i), -1.1 * i * i, -0.9 * i * i),
+            ("participation_ratio", 10.0 * i, 5.0 * i, math.nan),
+        ):
+            row |= {name: value, f"{name}_low": low, f"{name}_high": high}
         found.append(row)
     found[0] = {key: value for key, value in found[0].items() if key in COLUMNS[:6]} | {"state": "skipped"}
     return pd.DataFrame(found, columns=list(COLUMNS))
@@ -111,12 +102,8 @@ def test_powers_of_ten_have_a_line_and_the_legend_says_what_is_open():
     figure = trajectory.draw(rows(1e-4).assign(run="a"))
     titles = [axes.get_title() for axes in figure.axes]
     assert "smallest eigenvalue\n(×10⁻⁶)" in titles and "largest eigenvalue\n(×10⁻⁶)" in titles
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "a",
-        "open: the index is negative",
-        "triangle: at least so large",
-        UNITS,
-    ]
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert said == ["a", "open: the index is negative", "triangle: at least so large", UNITS]
     positive = rows().assign(run="a")
     positive["eigenvalue_ratio"] = positive["eigenvalue_ratio"].abs()
     positive["participation_ratio_high"] = 2 * positive["participation_ratio"]
@@ -162,10 +149,8 @@ def test_the_command_prints_first_and_last_values_and_writes_the_files(tmp_path,
 )
 def test_a_figures_script_given_something_else_says_what_it_expects(tmp_path, module, words):
     given = [str(tmp_path)] if module == "trajectory" else []
-    done = subprocess.run(
-        [sys.executable, "-m", f"figures.{module}", *given], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 2 and done.stderr.startswith(words) and done.stderr.count("\n") == 1
+    ended = subprocess.run([sys.executable, "-m", f"figures.{module}", *given], capture_output=True, text=True)
+    assert ended.returncode == 2 and ended.stderr.startswith(words) and ended.stderr.count("\n") == 1
 
 
 def test_a_run_without_records_or_named_twice_is_refused_with_what_to_do(tmp_path, capsys):

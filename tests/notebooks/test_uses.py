@@ -5,11 +5,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from landscape.errors import InputError
 from notebooks.uses import study
 from notebooks.uses.__main__ import main
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from tests.refusals import refused
 
 MADE = synthetic_scene(SyntheticSettings(gaussians=50, views=9, width=24, height=16))
 STUDY = """out = "out"
@@ -72,8 +72,7 @@ def test_a_study_that_cannot_be_is_refused(folder, line, words):
     name = line.split(" = ")[0]
     kept = [each for each in STUDY.splitlines() if not each.startswith(name)]
     (folder / "wrong.toml").write_text("\n".join([line, *kept]))
-    with pytest.raises(InputError, match=words):
-        main([str(folder / "wrong.toml")])
+    refused(words, main, [str(folder / "wrong.toml")])
 
 
 @pytest.mark.parametrize(
@@ -86,13 +85,11 @@ def test_a_study_that_cannot_be_is_refused(folder, line, words):
 def test_a_study_that_repeats_itself_or_leads_out_is_refused_before_it_begins(tmp_path, change):
     file = tmp_path / "study.toml"
     file.write_text(f'out = "out"\n{change}\n[scenes.fern]\npath = "fern"\n')
-    with pytest.raises(InputError, match=r"study\.toml"):
-        study.run_study(file)
+    refused(r"study\.toml", study.run_study, file)
     assert list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[1]", '{"told": "this", "rows": []}', '{"told": "this", "rows": [{}]}'])
 def test_a_damaged_cell_is_refused_with_the_remedy(tmp_path, content):
     (tmp_path / "cell.json").write_text(content)
-    with pytest.raises(InputError, match="remove it, and it is measured again"):
-        study._kept(tmp_path / "cell.json", "this")
+    refused("remove it, and it is measured again", study._kept, tmp_path / "cell.json", "this")

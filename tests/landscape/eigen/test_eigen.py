@@ -8,6 +8,7 @@ import torch
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.operators.operator import CountingOperator, DenseOperator
 from tests.landscape.spectra import SPECTRA, Broken, N, Noisy, eigenvalues, generator, operator
+from tests.refusals import misused
 
 SETTINGS = {
     "one pair": EigenSettings(rtol=1e-3),
@@ -232,8 +233,7 @@ def test_a_shorter_random_part_of_a_good_start_needs_fewer_products():
     start = torch.cat([found.largest.vectors, found.smallest.vectors], dim=1)
     runs = [extreme_eigenpairs(H, generator(), EigenSettings(noise=noise), start) for noise in (1.0, 1e-1, 1e-3)]
     assert runs[0].matvecs > runs[1].matvecs > runs[2].matvecs
-    with pytest.raises(ValueError, match="noise > 0"):
-        EigenSettings(noise=0.0)
+    misused("noise > 0", EigenSettings, noise=0.0)
 
 
 @pytest.mark.parametrize("spectrum", ["gaps", "cluster", "dense"])
@@ -316,24 +316,17 @@ def test_progress_counts_matvecs_up_to_the_budget():
 
 
 def test_products_that_are_not_finite_are_an_error():
-    with pytest.raises(ValueError, match="finite products"):
-        extreme_eigenpairs(Broken(torch.eye(5)), generator())
+    misused("finite products", extreme_eigenpairs, Broken(torch.eye(5)), generator())
 
 
 def test_bad_requests_are_refused():
-    with pytest.raises(ValueError, match="not both 0"):
-        EigenSettings(0, 0)
-    with pytest.raises(ValueError, match="a basis of at least 5 vectors"):
-        EigenSettings(basis=4)
-    with pytest.raises(ValueError, match="max_matvecs >= 7"):
-        EigenSettings(max_matvecs=6)
-    with pytest.raises(ValueError, match="at most 2 eigenpairs"):
-        extreme_eigenpairs(DenseOperator(torch.eye(2)), generator(), EigenSettings(2, 1))
-    with pytest.raises(ValueError, match="start vectors that are not zero"):
-        extreme_eigenpairs(operator("zero"), generator(), start=torch.zeros(N))
+    misused("not both 0", EigenSettings, 0, 0)
+    misused("a basis of at least 5 vectors", EigenSettings, basis=4)
+    misused("max_matvecs >= 7", EigenSettings, max_matvecs=6)
+    misused("at most 2 eigenpairs", extreme_eigenpairs, DenseOperator(torch.eye(2)), generator(), EigenSettings(2, 1))
+    misused("start vectors that are not zero", extreme_eigenpairs, operator("zero"), generator(), start=torch.zeros(N))
     for name in ("rtol", "atol", "noise", "max_seconds"):
-        with pytest.raises(ValueError, match=f"{name}.* got .*nan"):
-            replace(EigenSettings(), **{name: nan})
+        misused(f"{name}.* got .*nan", replace, EigenSettings(), **{name: nan})
 
 
 @pytest.mark.parametrize("block", [1, 2])

@@ -7,6 +7,7 @@ from landscape.eigen.lanczos import lanczos
 from landscape.eigen.power import PowerSettings, power_ends, power_iteration, power_of_runs
 from landscape.operators.operator import CountingOperator, DenseOperator
 from tests.landscape.spectra import Broken, N, eigenvalues, generator, operator
+from tests.refusals import misused
 
 
 @pytest.mark.parametrize("name", ["power law", "both tails", "clustered", "negative", "multiple"])
@@ -79,19 +80,16 @@ def test_power_iteration_of_zero_is_zero():
 
 
 def test_bad_power_settings_are_refused():
-    with pytest.raises(ValueError, match="max_matvecs >= 1"):
-        PowerSettings(max_matvecs=0)
+    misused("max_matvecs >= 1", PowerSettings, max_matvecs=0)
 
 
 def test_products_that_are_not_finite_are_an_error():
-    with pytest.raises(ValueError, match="finite products"):
-        power_iteration(Broken(torch.eye(5)), generator())
+    misused("finite products", power_iteration, Broken(torch.eye(5)), generator())
 
 
 @pytest.mark.parametrize("wrong", ["rtol", "atol"])
 def test_a_power_setting_that_is_no_number_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"got .*nan"):
-        replace(PowerSettings(), **{wrong: float("nan")})
+    misused(r"got .*nan", replace, PowerSettings(), **{wrong: float("nan")})
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])

@@ -17,6 +17,7 @@ from landscape.spectrum.density import spectral_density
 from landscape.traces.diagonal import estimate_diagonal
 from landscape.traces.trace import TraceSettings, estimate_traces
 from tests.oracles import symmetric_matrix
+from tests.refusals import misused
 
 N = 7
 BLOCKS = {"a": slice(0, 3), "b": slice(3, N)}
@@ -95,8 +96,7 @@ def test_seconds_are_those_until_a_gpu_has_the_product(monkeypatch):
 
 @pytest.mark.parametrize("name", COMPOSED)
 def test_a_flat_vector_is_refused_with_the_remedy(name):
-    with pytest.raises(ValueError, match=r"expected V of shape \(n, k\) with n = 7, got \(7,\); use V\[:, None\]"):
-        COMPOSED[name][0].apply(V[:, 0])
+    misused(r"expected V of shape \(n, k\) with n = 7, got \(7,\); use V\[:, None\]", COMPOSED[name][0].apply, V[:, 0])
 
 
 def test_a_vector_of_another_length_is_refused():
@@ -105,42 +105,30 @@ def test_a_vector_of_another_length_is_refused():
 
 
 def test_dense_refuses_what_is_not_a_symmetric_finite_matrix():
-    with pytest.raises(ValueError, match="square"):
-        DenseOperator(A[:3])
-    with pytest.raises(ValueError, match=r"use \(A \+ A.T\) / 2"):
-        DenseOperator(A + torch.triu(torch.ones(N, N)))
-    with pytest.raises(ValueError, match="finite"):
-        DenseOperator(A / 0)
+    misused("square", DenseOperator, A[:3])
+    misused(r"use \(A \+ A.T\) / 2", DenseOperator, A + torch.triu(torch.ones(N, N)))
+    misused("finite", DenseOperator, A / 0)
 
 
 def test_blocks_must_be_disjoint_ranges_of_rows():
-    with pytest.raises(ValueError, match="disjoint"):
-        DenseOperator(A, {"a": slice(0, 4), "b": slice(3, N)})
-    with pytest.raises(ValueError, match="disjoint"):
-        DenseOperator(A, {"a": slice(0, N + 1)})
-    with pytest.raises(ValueError, match=r"slice\(start, stop\)"):
-        DenseOperator(A, {"a": slice(0, N, 2)})
+    misused("disjoint", DenseOperator, A, {"a": slice(0, 4), "b": slice(3, N)})
+    misused("disjoint", DenseOperator, A, {"a": slice(0, N + 1)})
+    misused(r"slice\(start, stop\)", DenseOperator, A, {"a": slice(0, N, 2)})
 
 
 def test_an_unknown_block_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match="a block out of a, b, got 'c'"):
-        RestrictedOperator(DenseOperator(A, BLOCKS), "c")
+    misused("a block out of a, b, got 'c'", RestrictedOperator, DenseOperator(A, BLOCKS), "c")
 
 
 def test_a_sum_needs_terms_that_fit():
-    with pytest.raises(ValueError, match="at least one"):
-        SumOperator([])
-    with pytest.raises(ValueError, match="7 rows"):
-        SumOperator([DenseOperator(A), DenseOperator(A[:3, :3])])
-    with pytest.raises(ValueError, match="one weight per operator"):
-        SumOperator([DenseOperator(A)], [1.0, 2.0])
+    misused("at least one", SumOperator, [])
+    misused("7 rows", SumOperator, [DenseOperator(A), DenseOperator(A[:3, :3])])
+    misused("one weight per operator", SumOperator, [DenseOperator(A)], [1.0, 2.0])
 
 
 def test_scales_must_fit_and_be_finite():
-    with pytest.raises(ValueError, match="7 finite scales"):
-        ScaledOperator(DenseOperator(A), SCALE[:3])
-    with pytest.raises(ValueError, match="7 finite scales"):
-        ScaledOperator(DenseOperator(A), SCALE / 0)
+    misused("7 finite scales", ScaledOperator, DenseOperator(A), SCALE[:3])
+    misused("7 finite scales", ScaledOperator, DenseOperator(A), SCALE / 0)
 
 
 class Wrong(DenseOperator):
@@ -175,5 +163,4 @@ MISTAKES = {
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_every_estimator_refuses_products_of_another_shape_or_not_finite(estimator, mistake):
     change, expected = MISTAKES[mistake]
-    with pytest.raises(ValueError, match=expected):
-        ESTIMATORS[estimator](Wrong(change), torch.Generator().manual_seed(0))
+    misused(expected, ESTIMATORS[estimator], Wrong(change), torch.Generator().manual_seed(0))

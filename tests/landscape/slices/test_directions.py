@@ -3,6 +3,7 @@ import torch
 
 from landscape.slices.directions import gradient_direction, groups_of, line_between, orthonormal, random_directions
 from landscape.slices.slices import SliceSettings, evaluate_slice
+from tests.refusals import misused
 
 BLOCKS = {"position": slice(0, 12), "weight": slice(12, 16)}
 GROUPS = groups_of(BLOCKS, items=4, n=16)
@@ -11,8 +12,7 @@ CENTER = torch.linspace(-3, 4, 16, dtype=torch.float64)
 
 def test_each_attribute_of_each_item_is_a_group():
     assert GROUPS.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 5, 6, 7]
-    with pytest.raises(ValueError, match="blocks of 5 items, got 12 parameters in position"):
-        groups_of(BLOCKS, items=5, n=16)
+    misused("blocks of 5 items, got 12 parameters in position", groups_of, BLOCKS, items=5, n=16)
 
 
 def test_a_random_direction_is_as_long_in_every_group_as_its_parameters():
@@ -76,19 +76,11 @@ def test_orthonormal_directions_span_the_same_plane_and_keep_the_first():
 
 def test_bad_directions_are_refused():
     generator = torch.Generator().manual_seed(0)
-    with pytest.raises(ValueError, match="one group number, from 0, for each of 16 parameters"):
-        random_directions(CENTER, GROUPS[:5], generator)
-    with pytest.raises(ValueError, match="one group number"):
-        random_directions(CENTER, GROUPS - 1, generator)
-    with pytest.raises(ValueError, match="not all zero"):
-        random_directions(0 * CENTER, GROUPS, generator)
-    with pytest.raises(ValueError, match="not zero"):
-        gradient_direction(torch.zeros(3))
-    with pytest.raises(ValueError, match="same parameters, got \\(16,\\) and \\(15,\\)"):
-        line_between(CENTER, CENTER[:15])
-    with pytest.raises(ValueError, match="that differ"):
-        line_between(CENTER, CENTER)
-    with pytest.raises(ValueError, match="not parallel"):
-        orthonormal(torch.stack([CENTER, -2 * CENTER], dim=1))
-    with pytest.raises(ValueError, match="not zero"):
-        orthonormal(torch.zeros(4, 2))
+    misused("one group number, from 0, for each of 16 parameters", random_directions, CENTER, GROUPS[:5], generator)
+    misused("one group number", random_directions, CENTER, GROUPS - 1, generator)
+    misused("not all zero", random_directions, 0 * CENTER, GROUPS, generator)
+    misused("not zero", gradient_direction, torch.zeros(3))
+    misused("same parameters, got \\(16,\\) and \\(15,\\)", line_between, CENTER, CENTER[:15])
+    misused("that differ", line_between, CENTER, CENTER)
+    misused("not parallel", orthonormal, torch.stack([CENTER, -2 * CENTER], dim=1))
+    misused("not zero", orthonormal, torch.zeros(4, 2))

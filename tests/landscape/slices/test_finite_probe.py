@@ -5,6 +5,7 @@ import torch
 from landscape.operators.operator import DenseOperator
 from landscape.slices.finite_probe import NOISE_POINTS, ORDER, STEPS, evaluation_noise, finite_probe
 from tests.oracles import symmetric_matrix
+from tests.refusals import misused
 
 N = 5
 A = torch.from_numpy(symmetric_matrix(np.linspace(-1, 3, N), seed=0))
@@ -130,15 +131,11 @@ def test_progress_counts_the_evaluations():
 
 
 def test_bad_probes_are_refused():
-    with pytest.raises(ValueError, match="direction of its length"):
-        finite_probe(quartic, CENTER, V[:3], DenseOperator(A))
-    with pytest.raises(ValueError, match="direction that is not zero"):
-        finite_probe(quartic, CENTER, 0 * V, DenseOperator(A))
+    misused("direction of its length", finite_probe, quartic, CENTER, V[:3], DenseOperator(A))
+    misused("direction that is not zero", finite_probe, quartic, CENTER, 0 * V, DenseOperator(A))
     for steps in ((1.0,), (0.0, 1.0), (1.0, 0.5)):
-        with pytest.raises(ValueError, match="positive steps that increase"):
-            probed(quartic, steps=steps)
-    with pytest.raises(ValueError, match="finite objective at the centre"):
-        probed(lambda theta: float("nan"))
+        misused("positive steps that increase", probed, quartic, steps=steps)
+    misused("finite objective at the centre", probed, lambda theta: float("nan"))
     seen = []
     with pytest.raises(ValueError, match=f"more than {ORDER} noise points, got {ORDER}"):
         finite_probe(lambda theta: seen.append(theta) or 0.0, CENTER, V, DenseOperator(A), noise_points=ORDER)

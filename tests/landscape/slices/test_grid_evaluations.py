@@ -7,6 +7,7 @@ import torch
 from landscape.slices.refinement import SliceSettings
 from landscape.slices.slices import evaluate_slice, symmetric_axis
 from splat.model.untrusted import KeptArrays
+from tests.refusals import misused
 from tests.waiting import PATIENCE
 
 CENTER = torch.linspace(-1, 1, 6, dtype=torch.float64)
@@ -99,8 +100,7 @@ def test_the_evaluations_of_another_slice_are_refused(tmp_path, changed):
     store = tmp_path / "slice.npz"
     sliced(Objective(), store, tolerance=0.1)
     before = store.read_bytes()
-    with pytest.raises(ValueError, match=r"another center, other directions.*delete this one"):
-        sliced(Objective(), store, **changed)
+    misused(r"another center, other directions.*delete this one", sliced, Objective(), store, **changed)
     assert store.read_bytes() == before
 
 
@@ -111,10 +111,8 @@ def test_the_evaluations_of_another_objective_are_refused(tmp_path):
 
     store = tmp_path / "slice.npz"
     sliced(Objective(), store, tolerance=0.1)
-    with pytest.raises(ValueError, match=r"evaluations of this objective.*0\.001 at the centre, got one that is 0\.0"):
-        sliced(shifted, store)
-    with pytest.raises(ValueError, match="evaluations of this objective"):
-        sliced(lambda theta: Objective()(theta)[0], store)
+    misused(r"evaluations of this objective.*0\.001 at the centre, got one that is 0\.0", sliced, shifted, store)
+    misused("evaluations of this objective", sliced, lambda theta: Objective()(theta)[0], store)
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
@@ -136,11 +134,9 @@ def test_a_damaged_file_is_refused(tmp_path):
     broken[whole.index(b"values.npy") + 200] ^= 0xFF
     for content in (b"", whole[: len(whole) // 2], bytes(broken), b"no archive"):
         store.write_bytes(content)
-        with pytest.raises(ValueError, match=r"got a damaged file.*delete this one"):
-            sliced(Objective(), store)
+        misused(r"got a damaged file.*delete this one", sliced, Objective(), store)
     np.savez(store, loss=np.zeros(3))
-    with pytest.raises(ValueError, match="damaged file"):
-        sliced(Objective(), store)
+    misused("damaged file", sliced, Objective(), store)
 
 
 def test_workers_evaluate_at_the_same_time():

@@ -6,6 +6,7 @@ import torch
 
 from landscape.slices.refinement import SliceSettings
 from landscape.slices.slices import evaluate_slice, symmetric_axis
+from tests.refusals import misused
 
 PLANE = torch.eye(2, dtype=torch.float64)
 SIDE = symmetric_axis(1.0, 41)
@@ -117,8 +118,7 @@ def test_the_centre_may_lie_anywhere_on_its_axes():
 
 
 def test_without_the_centre_on_its_axes_a_plane_is_refused():
-    with pytest.raises(ValueError, match="coordinates of a plane with 0 among them"):
-        sliced(bowl, axes=(torch.linspace(0.1, 1, 41).double(), SIDE))
+    misused("coordinates of a plane with 0 among them", sliced, bowl, axes=(torch.linspace(0.1, 1, 41).double(), SIDE))
 
 
 def test_the_stated_error_covers_every_point_of_slices_from_many_seeds():
@@ -190,11 +190,7 @@ def test_points_that_were_not_evaluated_are_not_marked_discontinuous():
 
 
 def test_settings_without_meaning_are_refused():
-    with pytest.raises(ValueError, match="tolerance between 0 and 1"):
-        SliceSettings(tolerance=0.0)
-    with pytest.raises(ValueError, match="at least 1"):
-        SliceSettings(holdout=0)
-    with pytest.raises(ValueError, match="positive budgets"):
-        SliceSettings(max_seconds=0.0)
-    with pytest.raises(ValueError, match="no budget for a slice of every point"):
-        SliceSettings(tolerance=None, max_evaluations=9)
+    misused("tolerance between 0 and 1", SliceSettings, tolerance=0.0)
+    misused("at least 1", SliceSettings, holdout=0)
+    misused("positive budgets", SliceSettings, max_seconds=0.0)
+    misused("no budget for a slice of every point", SliceSettings, tolerance=None, max_evaluations=9)

@@ -6,6 +6,7 @@ from landscape.operators.operator import DenseOperator
 from landscape.slices.refinement import SliceSettings
 from landscape.slices.slices import curvature_reach, evaluate_slice, symmetric_axis
 from tests.oracles import symmetric_matrix
+from tests.refusals import misused
 
 N = 9
 A = torch.from_numpy(symmetric_matrix(np.linspace(-1, 2, N), seed=0))
@@ -25,9 +26,8 @@ def test_the_slice_of_a_quadratic_is_its_model():
     directions = torch.stack([EIGENVECTORS[:, -1], EIGENVECTORS[:, 0] + EIGENVECTORS[:, 3]], dim=1)
     result = evaluate_slice(quadratic, CENTER, directions, AXES, gradient=G, operator=DenseOperator(A), settings=ALL)
     assert result.loss.shape == (5, 3) and result.center_loss == 7 and result.evaluations == 16
-    assert (
-        result.evaluated.all() and result.reason == "exact" and result.interpolation_error == result.share_beyond == 0
-    )
+    assert result.evaluated.all()
+    assert result.reason == "exact" and result.interpolation_error == result.share_beyond == 0
     assert result.difference is not None and result.difference.abs().max() < 1e-13
     assert result.slope is not None and torch.allclose(result.slope, directions.T @ G, rtol=0, atol=1e-14)
     assert result.curvature is not None
@@ -112,31 +112,22 @@ def test_progress_counts_the_points():
 
 
 def test_bad_slices_are_refused():
-    with pytest.raises(ValueError, match="one or two directions"):
-        evaluate_slice(quadratic, CENTER, EIGENVECTORS[:, :3], [*AXES, AXES[0]])
-    with pytest.raises(ValueError, match="one vector of coordinates per direction"):
-        evaluate_slice(quadratic, CENTER, EIGENVECTORS[:, :2], AXES[:1])
-    with pytest.raises(ValueError, match="directions that are not zero"):
-        evaluate_slice(quadratic, CENTER, 0 * EIGENVECTORS[:, :2], AXES)
-    with pytest.raises(ValueError, match="both gradient and operator"):
-        evaluate_slice(quadratic, CENTER, EIGENVECTORS[:, :2], AXES, gradient=G)
+    misused("one or two directions", evaluate_slice, quadratic, CENTER, EIGENVECTORS[:, :3], [*AXES, AXES[0]])
+    misused("one vector of coordinates per direction", evaluate_slice, quadratic, CENTER, EIGENVECTORS[:, :2], AXES[:1])
+    misused("directions that are not zero", evaluate_slice, quadratic, CENTER, 0 * EIGENVECTORS[:, :2], AXES)
+    misused("both gradient and operator", evaluate_slice, quadratic, CENTER, EIGENVECTORS[:, :2], AXES, gradient=G)
     for gradient, curvature, message in (
         (torch.nan * G, torch.eye(2), "finite gradient"),
         (G[:-1], torch.eye(2), "gradient of shape"),
         (G, torch.inf * torch.eye(2), "finite E.T H E"),
         (G, torch.eye(3), r"E.T H E of shape \(2, 2\)"),
     ):
-        with pytest.raises(ValueError, match=message):
-            evaluate_slice(quadratic, CENTER, EIGENVECTORS[:, :2], AXES, gradient, curvature)
-    with pytest.raises(ValueError, match="generator for the hold-out points"):
-        evaluate_slice(quadratic, CENTER, EIGENVECTORS[:, :2], AXES)
+        misused(message, evaluate_slice, quadratic, CENTER, EIGENVECTORS[:, :2], AXES, gradient, curvature)
+    misused("generator for the hold-out points", evaluate_slice, quadratic, CENTER, EIGENVECTORS[:, :2], AXES)
     with pytest.raises(ValueError, match="coordinates that increase"):
         evaluate_slice(quadratic, CENTER, EIGENVECTORS[:, :1], [torch.tensor([0.0, 1.0, 1.0])])
     with pytest.raises(ValueError, match="finite objective at the centre"):
         evaluate_slice(lambda theta: torch.inf, CENTER, EIGENVECTORS[:, :2], AXES, settings=ALL)
-    with pytest.raises(ValueError, match="odd number of points"):
-        symmetric_axis(1.0, 4)
-    with pytest.raises(ValueError, match="radius above 0"):
-        symmetric_axis(0.0)
-    with pytest.raises(ValueError, match="curvature that is not zero"):
-        curvature_reach(0.0, 1.0)
+    misused("odd number of points", symmetric_axis, 1.0, 4)
+    misused("radius above 0", symmetric_axis, 0.0)
+    misused("curvature that is not zero", curvature_reach, 0.0, 1.0)

@@ -13,6 +13,7 @@ from landscape.spectrum.density import SETTLED, ActiveSpace, draw_starts, spectr
 from landscape.spectrum.rules import SpectralDensity
 from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
 from tests.oracles import absolute_matrix
+from tests.refusals import misused
 
 
 @pytest.mark.parametrize("name", SPECTRA)
@@ -200,10 +201,8 @@ def test_a_known_null_space_is_left_out_of_the_sums():
 
 
 def test_bad_settings_are_refused():
-    with pytest.raises(ValueError, match="rank 1 or more"):
-        ActiveSpace(lambda V: V, 0)
-    with pytest.raises(ValueError, match="starts >= 2"):
-        spectral_density(operator("zero"), generator(), starts=1)
+    misused("rank 1 or more", ActiveSpace, lambda V: V, 0)
+    misused("starts >= 2", spectral_density, operator("zero"), generator(), starts=1)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 1 / 3])

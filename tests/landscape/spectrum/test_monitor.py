@@ -1,13 +1,12 @@
 """The table of a foreign training is one that `landscape trajectory` reads."""
 
 import pandas as pd
-import pytest
 import torch
 
 from analysis.runs.trajectories import gathered
 from landscape import EigenSettings, Monitor
-from landscape.errors import InputError
 from tests.landscape.foreign import Bumps
+from tests.refusals import refused
 
 
 def test_a_training_is_recorded_and_read(tmp_path):
@@ -36,7 +35,5 @@ def test_a_refused_operator_is_a_note_and_the_training_goes_on(tmp_path):
 
 def test_a_second_training_in_one_folder_and_no_steps_are_refused(tmp_path):
     Monitor(tmp_path, every=1)(1, Bumps(change=lambda image: image / 0).hessian)
-    with pytest.raises(InputError, match="folder without a trajectory"):
-        Monitor(tmp_path)
-    with pytest.raises(InputError, match="every 0 steps"):
-        Monitor(tmp_path / "other", every=0)
+    refused("folder without a trajectory", Monitor, tmp_path)
+    refused("every 0 steps", Monitor, tmp_path / "other", every=0)

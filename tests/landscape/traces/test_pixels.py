@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from landscape import gauss_newton_blocks, gauss_newton_diagonal, gauss_newton_traces
-from landscape.errors import InputError
 from landscape.operators.renderer.renderer import RendererHessian
 from tests.landscape.foreign import Bumps
+from tests.refusals import refused
 
 
 def squares(image: Tensor, view: float) -> Tensor:
@@ -73,9 +73,6 @@ def test_groups_of_samples_give_the_numbers_of_one():
 
 def test_too_few_samples_and_groups_out_of_range_are_refused():
     H, _ = bridge("diagonal")
-    with pytest.raises(InputError, match="at least 8 samples, got 7"):
-        gauss_newton_traces(H, generator(), samples=7)
-    with pytest.raises(InputError, match="at least 3 samples, got 2"):
-        gauss_newton_diagonal(H, generator(), samples=2)
-    with pytest.raises(InputError, match=r"numbers of rows in 0..23"):
-        gauss_newton_blocks(H, generator(), torch.tensor([[0, 24]]))
+    refused("at least 8 samples, got 7", gauss_newton_traces, H, generator(), samples=7)
+    refused("at least 3 samples, got 2", gauss_newton_diagonal, H, generator(), samples=2)
+    refused(r"numbers of rows in 0..23", gauss_newton_blocks, H, generator(), torch.tensor([[0, 24]]))

@@ -9,6 +9,7 @@ from landscape.operators.operator import CountingOperator, DenseOperator
 from landscape.traces.trace import PAPER, TraceSettings, estimate_traces
 from tests.landscape.spectra import Buffered
 from tests.oracles import symmetric_matrix
+from tests.refusals import misused
 
 N = 40
 BLOCKS = {"a": slice(0, 12), "b": slice(12, 13), "c": slice(13, N)}
@@ -154,29 +155,22 @@ def test_products_that_are_not_finite_are_an_error_that_names_the_block():
         def apply(self, V):
             return super().apply(V) / 0
 
-    with pytest.raises(ValueError, match=r"expected finite products H V.*in a"):
-        estimate_traces(Broken(INDEFINITE, BLOCKS), generator())
+    misused(r"expected finite products H V.*in a", estimate_traces, Broken(INDEFINITE, BLOCKS), generator())
 
 
 def test_bad_settings_are_refused():
-    with pytest.raises(ValueError, match="min_probes <= max_probes"):
-        TraceSettings(min_probes=10, max_probes=5)
+    misused("min_probes <= max_probes", TraceSettings, min_probes=10, max_probes=5)
     with pytest.raises(ValueError, match="'rademacher' or 'gaussian'"):
         TraceSettings(distribution="uniform")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="'block' or 'full'"):
         TraceSettings(reading="half")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="rtol, atol >= 0"):
-        TraceSettings(rtol=-1)
-    with pytest.raises(ValueError, match="expected 8 <= min_probes"):
-        TraceSettings.fixed(7)
-    with pytest.raises(ValueError, match=r"max_probes >= 24 with the method 'hutch[+][+]'"):
-        TraceSettings.fixed(23, method="hutch++")
+    misused("rtol, atol >= 0", TraceSettings, rtol=-1)
+    misused("expected 8 <= min_probes", TraceSettings.fixed, 7)
+    misused(r"max_probes >= 24 with the method 'hutch[+][+]'", TraceSettings.fixed, 23, method="hutch++")
     with pytest.raises(ValueError, match=r"'auto', 'hutchinson', 'hutch[+][+]' or 'xtrace', got 'exact'"):
         TraceSettings(method="exact")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="reading 'block' with the method 'xtrace'"):
-        TraceSettings(method="xtrace", reading="full")
-    with pytest.raises(ValueError, match="memory > 0"):
-        TraceSettings(memory=0.0)
+    misused("reading 'block' with the method 'xtrace'", TraceSettings, method="xtrace", reading="full")
+    misused("memory > 0", TraceSettings, memory=0.0)
     with pytest.raises(ValueError, match="blocks out of a, b, c, got 'd'"):
         estimate_traces(DenseOperator(INDEFINITE, BLOCKS), generator(), blocks=["d"])
 
@@ -195,8 +189,7 @@ def test_an_operator_may_give_the_same_memory_at_every_call(method):
 
 @pytest.mark.parametrize("wrong", ["rtol", "atol", "memory", "max_seconds"])
 def test_a_setting_that_is_no_number_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"got .*nan"):
-        replace(TraceSettings(), **{wrong: float("nan")})
+    misused(r"got .*nan", replace, TraceSettings(), **{wrong: float("nan")})
 
 
 @pytest.mark.parametrize("method", ["hutchinson", "hutch++", "xtrace", "auto"])
