@@ -17,7 +17,8 @@ from analysis.bench.workloads import Workload
 from splat.losses.reference import LossSettings
 from tests.splat.gpu.emulated import emulate
 from tests.splat.held_scenes import two_views
-from tests.splat.random_scenes import random_gaussians, relative_error
+from tests.splat.random_scenes import random_gaussians
+from tests.splat.tolerances import relative_error
 
 
 def toy() -> Workload:

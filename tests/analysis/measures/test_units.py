@@ -14,7 +14,8 @@ from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.training.state import LearningRates
 from tests.splat.held_scenes import BACKGROUND, two_views
-from tests.splat.random_scenes import random_gaussians, random_like, relative_error
+from tests.splat.random_scenes import random_gaussians, random_like
+from tests.splat.tolerances import relative_error
 
 
 def objective_in_a_world(unit: float = 1.0, apart: float = 0.0) -> SceneObjective:
