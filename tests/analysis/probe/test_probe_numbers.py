@@ -50,13 +50,13 @@ def test_eigenvalues_are_those_of_the_dense_hessian_within_their_residuals(recor
         assert abs(end.value - float(true[index])) <= end.residual + rounding(H), name
         assert end.residual <= 1e-3 * abs(end.value) and end.reason == "tolerance"
         assert sum(end.shares.values()) == pytest.approx(1) and list(end.shares) == ATTRIBUTES
-    saddle = record.data.anisotropy.negative_ratio
-    assert saddle.low <= float(-true[-1] / true[0]) <= saddle.high
+    ratio = record.data.anisotropy.negative_ratio
+    assert ratio.low <= float(-true[0] / true[-1]) <= ratio.high
     share = record.data.anisotropy.top_mass
     assert share.low <= float(true[-1] / true.abs().sum()) <= share.high
 
 
-def test_the_literal_index_is_by_power_iteration_where_that_arrived(record, dense):
+def test_the_eigenvalue_ratio_is_by_power_iteration_where_that_arrived(record, dense):
     _, H, _, _ = dense
     ends, eigenvalue_ratio = record.data.eigenvalues, record.data.anisotropy.eigenvalue_ratio
     true = torch.linalg.eigvalsh((H + H.T) / 2)
