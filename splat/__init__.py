@@ -10,7 +10,8 @@
     TrainConfig, Training, train    what a training does; its state; its steps
     METHODS                     what a training adds to 3DGS, by name
     evaluate                    PSNR, SSIM, LPIPS of views
-    load_checkpoint             a training, with its scene, from a file
+    open_subject                a run, a checkpoint or another tool's file, with its scene
+    Foreign                     what another tool's file does not say
     SceneObjective              the mean loss over views as a function of the Gaussians' parameters
     SceneHessian                its Hessian as an operator for the estimators of `landscape`
     exact_traces                the traces of its blocks

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
-from analysis.console.options import DeviceName, Unset
+from analysis.console.options import Device
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,10 @@ class BenchOptions:
     sizes: Annotated[tuple[str, ...], arg(metavar="SIZE...", help_behavior_hint="")] = ()
     """Synthetic scenes to measure, GAUSSIANS@WIDTHxHEIGHT in pixels.
     Default: 10k@504x378 100k@504x378; none beside a run or a scene."""
-    images: Unset[str] = None
+    images: str | None = None
     """Of a scene's folder: the folder of images within it.  Default: images, else the largest images_K."""
     downscale: float = 1.0
     """Reduce the images of a scene's folder, or of accuracy's run, further by this factor."""
-    device: DeviceName = "auto"
-    """Where a scene is measured.  auto: on the GPU where there is one that can be used, else on the CPU."""
-    bounds: FlagCreatePairsOff[bool] = False
+    device: Device = "auto"
+    bounds: bool = False
     """Print the ratios that the project promises with their bounds, which bounds.csv has."""

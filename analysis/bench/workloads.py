@@ -17,7 +17,7 @@ from splat.scenes.scene import load_scene
 from splat.scenes.splits import split_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.view import View
-from splat.training.checkpoint import load_checkpoint
+from splat.training.checkpoint import open_subject
 from splat.training.start import gaussians_from_points
 
 
@@ -92,11 +92,10 @@ def workload_of(path: Path, images: str | None = None, downscale: float = 1.0) -
     Raises FileNotFoundError or ValueError where the path is neither, or the scene has no points.
     """
     if path.is_file():
-        checkpoint = load_checkpoint(path)
-        scene, config = checkpoint.load_scene(path), checkpoint.training.config
-        name = f"{scene.name}, step {checkpoint.training.step}"
-        views = tuple(scene.load(checkpoint.scene.train))
-        return Workload(name, checkpoint.training.gaussians, views, scene.background, config.loss, config.render)
+        subject = open_subject(path)
+        training, scene, config = subject.checkpoint.training, subject.scene, subject.checkpoint.training.config
+        views, name = tuple(scene.load(subject.checkpoint.scene.train)), f"{scene.name}, step {training.step}"
+        return Workload(name, training.gaussians, views, scene.background, config.loss, config.render)
     scene = load_scene(path, images, downscale)
     if scene.points is None:
         raise InputError(f"expected a scene with points, got {path} without any; train it and give the checkpoint")

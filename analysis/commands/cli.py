@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from importlib.metadata import version
 from io import TextIOWrapper
@@ -26,7 +26,7 @@ from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, S
 from analysis.commands.uses.options import NextViewOptions, PruneOptions, UncertaintyOptions
 from analysis.console.failures import report
 from analysis.console.interruption import interruption, loading
-from analysis.console.options import REGISTRY
+from analysis.console.options import registry
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import CompareOptions, SweepOptions, TrajectoryOptions
 from analysis.slice.options import SliceOptions
@@ -197,21 +197,29 @@ def _parsed(arguments: Sequence[str]) -> tuple[Command, Any]:
     """
     name = (*arguments, "")[0]
     if found := COMMANDS.get(name):
-        about = f"{inspect.getdoc(found.options)}\n\nExample: landscape {name} {found.example}".rstrip()
-        config = (tyro.conf.DisallowNone,)
+        elsewhere = name != "convert" and bool({"-h", "--help"} & {*arguments})
         return found, tyro.cli(
             found.options,
             prog=f"landscape {name}",
-            description=about,
+            description=_about(name, found),
             args=arguments[1:],
-            config=config,
-            registry=REGISTRY,
+            config=(tyro.conf.DisallowNone,),
+            registry=registry(foreign=not elsewhere),
         )
     if name in ("-h", "--help"):
         print(overview())
         raise SystemExit(0)
     wrong = f", got {name!r}{did_you_mean(name, COMMANDS)}" if name else ", got none; landscape --help lists them"
     raise InputError(f"expected a command among {', '.join(COMMANDS)}{wrong}")
+
+
+def _about(name: str, command: Command) -> str:
+    """What stands above the options in a command's help; those of other tools' files are in the help of convert alone."""
+    lines = [str(inspect.getdoc(command.options)), f"Example: landscape {name} {command.example}".rstrip()]
+    if name != "convert" and (foreign := command.options.__dataclass_fields__.get("foreign")):
+        names = ", ".join(f"--{each.name.replace('_', '-')}" for each in fields(foreign.default_factory))
+        lines.insert(1, f"Also, as landscape convert --help explains: {names}")
+    return "\n\n".join(lines)
 
 
 def at_files(options: Any) -> Any:

@@ -14,7 +14,6 @@ from rich.console import Console
 
 from analysis.commands.options import ConvertOptions
 from analysis.console.plain import say
-from analysis.probe.command import opened
 from analysis.runs.sweep.sweep_file import arguments
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError
@@ -27,10 +26,11 @@ from splat.projection.antialias import baked
 from splat.render.render import render_depth
 from splat.scenes.scene import Scene
 from splat.scenes.splits import split_scene
-from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
+from splat.training.checkpoint import load_checkpoint, open_subject, save_checkpoint, write_atomically
 from splat.training.origin.frames import shift_in_words, shift_of
 from splat.training.origin.presets import PRESETS, render_of
 from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import Checkpoint
 
 OURS = ("splat-landscape", "splat-landscape-mip")
 FAINT = 0.01  # of alpha: what is less covered is as far as the farthest that is not
@@ -67,7 +67,7 @@ def _to_own(options: ConvertOptions) -> list[str]:
         raise InputError(
             f"expected another tool's file to make our own of, got {options.source}; name --to graphdeco or gsplat"
         )
-    checkpoint, _ = opened(options.source, options.scene, options.foreign, options.out)
+    checkpoint = open_subject(options.source, options.foreign, options.out).checkpoint
     here = os.path.relpath(checkpoint.scene.absolute, options.out.parent.resolve())
     save_checkpoint(options.out, checkpoint.training, replace(checkpoint.scene, relative=here))
     extra = read_splats(options.source).extra
@@ -111,7 +111,8 @@ def _unsaid(back: SplatFile, seen: Seen | None) -> list[str]:
 
 def _to_depths(options: ConvertOptions) -> list[str]:
     """Expected depth of every view of the scene, held out or not, as NAME.npy; of alpha 1 by division."""
-    checkpoint, scene = opened(options.source, options.scene, options.foreign, options.out)
+    subject = open_subject(options.source, options.foreign, options.out)
+    checkpoint, scene = subject.checkpoint, subject.scene
     training = checkpoint.training
     views = scene.load([frame.name for frame in scene.frames])
     with torch.no_grad():

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from analysis.console.options import CheckpointPath, Foreign, ForeignOptions, SceneFolder, Unset
+from analysis.console.options import CheckpointPath, OtherTools
+from splat.training.origin.options import Foreign
 
 
 @dataclass(frozen=True)
@@ -15,7 +16,7 @@ class SfmOptions:
 
     photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
     """Folder of the photographs: at least 3 of one scene that does not move, from different places."""
-    out: Unset[Path] = None
+    out: Path | None = None
     """Folder of the scene, which must not exist yet.  Default: PHOTOS-scene, beside the photographs."""
 
 
@@ -31,11 +32,9 @@ class ConvertOptions:
     """The file to read."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """The file to write, of depths the folder, which must not exist yet."""
-    to: Unset[Literal["graphdeco", "gsplat", "own", "depths"]] = None
+    to: Literal["graphdeco", "gsplat", "own", "depths"] | None = None
     """What to write.  Default: graphdeco's PLY where OUT ends in .ply, else our own checkpoint."""
-    scene: Unset[Path] = None
-    """Folder of the scene, for our own checkpoint or depths of another tool's file."""
-    foreign: Foreign = field(default_factory=ForeignOptions)
+    foreign: OtherTools = field(default_factory=Foreign)
 
 
 @dataclass(frozen=True)
@@ -50,10 +49,9 @@ class MapOptions:
     """A training view to draw, by name or by place (0 is the first); may be given again.  Default: all of them."""
     seed: int = 0
     """Seed of the pairs of neighbours whose swap is rendered."""
-    scene: SceneFolder = None
-    out: Unset[Path] = None
+    out: Path | None = None
     """Folder of the results.  Default: map, beside the checkpoint."""
-    foreign: Foreign = field(default_factory=ForeignOptions)
+    foreign: OtherTools = field(default_factory=Foreign)
 
 
 @dataclass(frozen=True)
@@ -67,12 +65,11 @@ class ViewOptions:
     """Where the page is served; the next free one where it is taken."""
     host: str = "127.0.0.1"
     """Who may open the page; 0.0.0.0: everybody who reaches this machine."""
-    html: Unset[Path] = None
+    html: Path | None = None
     """Write a page that needs no server to this file instead: cameras, and splats whose colours are switched between
     some fields.
     RUN/view.html is linked to by the probe's report."""
-    scene: SceneFolder = None
-    foreign: Foreign = field(default_factory=ForeignOptions)
+    foreign: OtherTools = field(default_factory=Foreign)
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,7 @@ def gradient_ratio(objective: SceneObjective) -> float:
         along_and_across(view.gradient[rows].view(-1, 3), ray)
         for view, ray in zip(objective.linearized, rays, strict=True)
     ]
-    return _ratio(objective.gather_rows(torch.stack(parts, dim=1)).flatten(0, 1).double())
+    return _ratio(torch.stack(parts, dim=1).flatten(0, 1).double())
 
 
 def measure_depth(
@@ -163,13 +163,13 @@ def depth_split(
             sums[:, part] += _split_traces(
                 view.block_diagonal(gauss_newton=gauss_newton, approximate=True).geometry[:, :3, :3], ray
             ).cpu()
-    pairs = objective.gather_rows(torch.stack(components, dim=1)).flatten(0, 1)
+    pairs = torch.stack(components, dim=1).flatten(0, 1)
     dims = (len(objective.active), LATERAL_DIRECTIONS * len(objective.active))
     traces = [
         SampledTrace(
             kind, dim, known, pixelwise[0] if pixelwise else None, settings, settings.min_probes, settings.max_probes
         )
-        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean_over_views(sums).tolist(), strict=True)
+        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, (sums / len(objective.views)).tolist(), strict=True)
     ]
     found = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
     return DepthSplit(pairs[pairs.any(dim=1)], **found)
@@ -187,10 +187,10 @@ def depth_rises(
         raise InputError(f"expected at least 2 draws, got {draws}")
     seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
     rises, discontinuous = torch.zeros(2, len(steps), len(KINDS), draws, dtype=torch.float64)
-    for index, number in enumerate(objective.view_numbers):
+    for index in range(len(objective.views)):
         center, piece = objective.evaluate_view(index, objective.active)
         for draw, seed in enumerate(seeds):
-            directions = _directions(objective, index, torch.Generator(generator.device).manual_seed(seed + number))
+            directions = _directions(objective, index, torch.Generator(generator.device).manual_seed(seed + index))
             for s, step in enumerate(steps):
                 for kind, direction in enumerate(directions):
                     ends = [_moved(objective, index, sign * step * direction) for sign in (1, -1)]
@@ -200,7 +200,7 @@ def depth_rises(
                 progress(
                     index * draws + draw + 1, len(objective.views) * draws, "finite steps along and across the rays"
                 )
-    rises, discontinuous = objective.mean_over_views(rises), objective.mean_over_views(discontinuous)
+    rises, discontinuous = rises / len(objective.views), discontinuous / len(objective.views)
     return DepthRises(tuple(steps), rises.mean(dim=2), rises.std(dim=2) / draws**0.5, discontinuous.mean(dim=2))
 
 

@@ -59,13 +59,14 @@ def check_against_gradient(
 ) -> ProductCheck:
     """The relative error of H v for one random v.
 
-    views: how many to take, from the first of this process; all by default.  For some views, P leaves out the quaternions'
+    views: how many to take, from the first; all by default.  For some views, P leaves out the quaternions'
     lengths alone: what is flat for all views together need not be flat for each.
     """
     objective = hessian.objective
     leave_out = hessian.project if views is None else partial(_without_lengths, objective.active)
     direction = leave_out(_direction(objective, generator)[:, None])[:, 0]
-    operator = ProjectedOperator(SceneHessian(objective, keep_null=True, count=views), leave_out)
+    shown = range(len(objective.views))[:views]
+    operator = ProjectedOperator(SceneHessian(objective, keep_null=True, indices=shown), leave_out)
     found = _differences(operator, objective, direction, progress, views)
     if found.error <= ENOUGH or objective.active.flat.dtype == torch.float64:
         return ProductCheck(found, None)
@@ -85,7 +86,6 @@ def _in_double(objective: SceneObjective, views: int | None) -> SceneObjective:
         objective.background.double(),
         objective.settings,
         keep_unseen=True,
-        ranks=objective.ranks,
     )
 
 
@@ -130,7 +130,7 @@ def _gradient(
         done += 1
         if progress:
             progress(done, most, "gradients in double precision")
-        return _without_lengths(double, objective.mean_over_views(total.flat)[:, None])[:, 0]
+        return _without_lengths(double, total.flat[:, None] / len(objective.views))[:, 0]
 
     return gradient
 

@@ -1,20 +1,21 @@
 """Limits by memory: how many vectors fit; and, before anything is measured, whether a probe or a slice does."""
 
 import re
-from collections.abc import Sequence
+from dataclasses import dataclass
 from math import ceil
-
-import torch
 
 from landscape import EigenSettings
 from landscape.errors import InputError, TooLittleMemory
 from splat.backend.memory import SLACK, free_memory, is_told, resident_memory
+from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
-from splat.model.gaussians import Gaussians
-from splat.scenes.view import Frame
+from splat.render.forward import rasterize_view
 
+GEOMETRY_BLOCK = 11 * 11  # numbers of a Gaussian's block without SH
+KEPT_BLOCKS = 4  # sets of blocks: approximate and exact ones, each of the Hessian and of a Gauss-Newton part
+COPIES = 5  # of a vector in a product: the argument, its projection, the sum over views, a view's product, the result
+BASIS, BATCH = 8, 4  # vectors of the smallest basis of an eigensolver, and in its products
 GIB = 2**30
-PICTURES, COPIES = 12, 4  # planes of a view, its loss's included; copies of the Gaussians
 
 
 def vectors_within(objective: SceneObjective, memory: float) -> int:
@@ -43,28 +44,44 @@ def size_of(text: str | None) -> int | None:
     return int(float(match[1]) * unit ** (1 + "kmgt".index(match[2].lower())))
 
 
-def require_pictures(frames: Sequence[Frame], gaussians: Gaussians) -> None:
-    """TooLittleMemory that says what would fit, where pictures and Gaussians alone take more than is free."""
-    each = [PICTURES * 4 * frame.camera.width * frame.camera.height for frame in frames]
-    fixed, left = COPIES * gaussians.flat.nbytes, free_memory(torch.device("cpu"))
-    if fixed + sum(each) <= left:
-        return
-    some = (left - fixed) // max(each)
-    raise TooLittleMemory(
-        f"expected {_size(fixed + sum(each))} of memory beside what is taken, for {len(frames)} pictures and "
-        f"{len(gaussians):,} Gaussians, got {_size(left)}; "
-        + (
-            f"--max-views {some} would fit"
-            if some > 0
-            else f"allow or free at least {_size(fixed + sum(each) - left)} more"
-        )
+@dataclass(frozen=True)
+class Needs:
+    """Estimated bytes.
+
+    vector: of a vector over the active parameters.  view: of the largest linearised view.  product: of a product, for each of
+    its vectors.  blocks: of the diagonal blocks of Gaussians that are kept.  making_blocks: of the pass that computes them.
+    """
+
+    vector: int
+    view: int
+    product: int
+    blocks: int
+    making_blocks: int
+
+    @property
+    def beside(self) -> int:
+        """Bytes needed in addition to linearised views: blocks, a small basis, and a product or the blocks' pass."""
+        return self.blocks + BASIS * self.vector + max(BATCH * self.product, self.making_blocks)
+
+
+def needs_of(objective: SceneObjective) -> Needs:
+    """What the largest view, its products and the blocks of the Gaussians need; renders every view."""
+    active, settings = objective.active, objective.settings
+    rasters = (
+        rasterize_view(active, view.camera, objective.background, settings, finite=True) for view in objective.views
     )
+    view, workspace, sums = max(LinearizedView.size_of(raster, active, settings) for raster in rasters)
+    blocks = len(active) * active.flat.element_size() * (GEOMETRY_BLOCK + 3 * (active.sh_degree + 1) ** 2)
+    product, making_blocks = workspace + COPIES * active.flat.nbytes, max(sums + blocks, 3 * blocks)
+    return Needs(active.flat.nbytes, view, product, KEPT_BLOCKS * blocks, making_blocks)
 
 
 def expected_peak(objective: SceneObjective) -> int:
-    """About the most that a probe takes at a time, in bytes.  TooLittleMemory that says what would fit, where less is
-    free."""
-    needs, device = objective.needs, objective.active.flat.device
+    """About the most that a probe takes at a time, bytes; sets how much of it the linearised views may have.
+
+    TooLittleMemory that says what would fit, where less is free.
+    """
+    needs, device = needs_of(objective), objective.active.flat.device
     free, used = free_memory(device), resident_memory() if device.type == "cpu" else 0
     least, camera = needs.view + needs.beside, objective.views[0].camera
     if least > free:
@@ -79,6 +96,7 @@ def expected_peak(objective: SceneObjective) -> int:
             f"{camera.width} x {camera.height} px, got {_size(used + free)}, of which {_size(used)} are taken; "
             f"{enough} would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
         )
+    objective.memory = min(free // 2, max(free - needs.beside, needs.view))
     return used + min(free, len(objective.views) * needs.view + needs.beside)
 
 

@@ -94,8 +94,8 @@ def steepest(
 
 
 def heaviest(objective: SceneObjective, vectors: Sequence[Float[Tensor, " p"]]) -> list[Carries]:
-    """The Gaussian with most mass in each eigenvector; with its shape where this process has all views, on the CPU."""
-    whole = objective.ranks.size == 1 and objective.active.flat.device.type == "cpu"
+    """The Gaussian with most mass in each eigenvector; with its shape on the CPU."""
+    whole = objective.active.flat.device.type == "cpu"
     sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views] if whole else []
     found = []
     for vector in vectors:

@@ -3,6 +3,8 @@
 parameters   D = 1: curvature per squared stored unit
 scene        positions in units of the scene's size, the rest as it is: what two scenes may be compared in
 optimiser    D the learning rate of every parameter at the first step: curvature per step of the training
+
+A curvature unit is a step along one direction: that within which the curvature alone changes the loss by RISE of it.
 """
 
 from dataclasses import asdict
@@ -16,6 +18,8 @@ from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
 from splat.training.state import LearningRates, learning_rates, position_rate
 
+RISE = 0.001  # of the loss, within a curvature unit
+UNITS = 3.0  # curvature units each way that a slice reaches by default
 Metric = Literal["parameters", "scene", "optimiser"]
 FACING = 0.7  # views are forward-facing where every axis keeps this share of its length along their mean
 

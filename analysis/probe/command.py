@@ -20,23 +20,21 @@ from rich.console import Console
 
 from analysis.console.drawing import Draw
 from analysis.console.kept import kept_stages
-from analysis.console.options import ForeignOptions
 from analysis.console.plain import say
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.measures.memory import expected_peak, require_pictures, size_of
+from analysis.measures.memory import expected_peak, size_of
 from analysis.measures.units import step_lengths
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.plan import expected_seconds, seconds_of_render
-from analysis.probe.record import probe_arrays, probe_record, provenance_of
+from analysis.probe.record import probe_arrays, probe_record
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import guess, remarks, steps_made, summary
 from analysis.probe.views import write_views
-from analysis.records.provenance import require_seed
+from analysis.records.provenance import provenance_of, require_seed
 from analysis.records.records import Arrays, ProbeRecord, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
-from analysis.train.source import of_trainer
 from landscape import EigenEnds
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
@@ -46,9 +44,9 @@ from splat.backend.memory import staying_within
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
-from splat.scenes.splits import read_names
-from splat.training.checkpoint import Checkpoint, open_checkpoint
+from splat.training.checkpoint import open_subject
 from splat.training.origin.fingerprint import Fingerprint
+from splat.training.origin.subject import Checkpoint
 
 if TYPE_CHECKING:
     from analysis.measures.per_attribute import PerAttributeOptions
@@ -60,7 +58,7 @@ DRAWING = 8.0  # seconds of the time limit that are left for the record and its 
 def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
     """Probe the checkpoint; returns the exit code.  command: as typed, for the record; drawn: see `write_with_pictures`.
 
-    Started by torchrun, the processes share the views, and the first one writes.
+    Started by torchrun, the processes share each product's views, and the first one writes.
     """
     require_seed(options.seed)
     device = device_named(options.device)
@@ -83,9 +81,10 @@ def _run(
     require_replaceable(out)
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
+        subject = open_subject(options.checkpoint, options.foreign, out)
+        checkpoint, scene = subject.checkpoint, subject.scene
         checkpoint.training.move(device)
-        objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
+        objective = subject.objective(loss=LossSettings() if options.loss == "3dgs" else None)
     guessed = guess(checkpoint.origin)
     say(*guessed, _introduction(scene, checkpoint, objective), console=console)
     say(_expected(objective, settings, 0.0 if families is None else families.products), console=console)
@@ -97,9 +96,9 @@ def _run(
         lengths = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
         found = measure(
             objective, settings, lengths, generator, stages, None if ranks else unfinished, identity,
-            deadline=begun + limit - DRAWING, population=checkpoint.all_views,
+            deadline=begun + limit - DRAWING, population=checkpoint.all_views, ranks=ranks or ALONE,
         )  # fmt: skip
-        origin = provenance_of(made, options.checkpoint, command, checkpoint, scene)
+        origin = provenance_of(made, subject, command)
         data, arrays = probe_record(found, objective, origin, stages.timing), probe_arrays(found)
         data.steps = lengths
         if families is not None:
@@ -178,36 +177,6 @@ def _write(
     from analysis.records.report import write_report
 
     write_report(folder)
-
-
-def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
-    """A checkpoint, of this toolkit or of another, and its scene.  out: a refusal may leave a picture, OUT-mismatch.png."""
-    listed = None if ask.train_list is None else read_names(ask.train_list)
-    files = replace(of_trainer(ask), scene=folder, images=ask.images, downscale=ask.downscale)
-    foreign = replace(files, views=ask.views, train_list=listed)
-    checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
-    checkpoint, scene = checkpoint.with_scene(path, folder, accept=ask.accept_changed)
-    return checkpoint.thinned(scene, ask.max_views), scene
-
-
-def scene_objective(
-    checkpoint: Checkpoint,
-    scene: Scene,
-    ranks: Ranks | None = None,
-    *,
-    keep_unseen: bool = False,
-    loss: LossSettings | None = None,
-) -> SceneObjective:
-    """Objective at the checkpoint, over the training views, with the training's loss by default.
-
-    ranks: processes that share the views.  keep_unseen: see `SceneObjective`.
-    """
-    ranks = ranks or ALONE
-    training, names = checkpoint.training, ranks.share(checkpoint.scene.train, "training view")
-    require_pictures(scene.select(names), training.gaussians)
-    views = scene.load(names)
-    config = replace(training.config, loss=loss or training.config.loss)
-    return config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
 
 def _settings(options: ProbeOptions) -> ProbeSettings:

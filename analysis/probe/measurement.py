@@ -57,6 +57,7 @@ from landscape import (
 )
 from landscape.eigen.lanczos import LanczosFactorization
 from landscape.eigen.power import power_of_runs
+from landscape.operators.distributed import ALONE, DistributedOperator, Ranks
 from landscape.probes import spawn
 from landscape.results import Progress
 from landscape.slices.finite_probe import FiniteProbe, finite_probe
@@ -104,14 +105,16 @@ def measure(
     identity: str = "",
     deadline: float = inf,
     population: int | None = None,
+    ranks: Ranks = ALONE,
 ) -> Measured:
     """Run every stage.
 
     lengths: of the optimiser's first step in a parameter, by attribute.  folder, identity, deadline: see `Kept`.  population:
-    number of training views, where the objective has fewer.
+    number of training views, where the objective has fewer.  ranks: processes that all measure the same, and share the views of
+    the operator's products.
     """
     with stages.stage("linearise") as report:
-        at = _linearised(objective, settings, report)
+        at = _linearised(objective, settings, ranks, report)
     with stages.stage("checks") as report:
         operator_check = check_operator(at.operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(at.hessian, spawn(generator), report, settings.checked_views)
@@ -122,7 +125,10 @@ def measure(
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A point of the loss, and the quantities that all stages use."""
+    """A point of the loss, and the quantities that all stages use.
+
+    hessian: this process's part.  operator: the whole, summed over ranks.
+    """
 
     objective: SceneObjective
     hessian: SceneHessian
@@ -130,14 +136,16 @@ class _Point:
     settings: ProbeSettings
     gradient: Tensor
     value: float
+    ranks: Ranks
 
     def work(self) -> list[int]:
         """Products H v so far, and products of single views that were known to be 0 and left out."""
         return [self.operator.matvecs, self.hessian.views.spared]
 
 
-def _linearised(objective: SceneObjective, settings: ProbeSettings, report: Progress) -> _Point:
-    hessian = SceneHessian(objective)
+def _linearised(objective: SceneObjective, settings: ProbeSettings, ranks: Ranks, report: Progress) -> _Point:
+    hessian = SceneHessian(objective, indices=ranks.share(range(len(objective.views)), "training view"))
+    operator = hessian if ranks.size == 1 else DistributedOperator(hessian, ranks)
     views = f"{len(objective.views)} views"
     report(0, 1, views)
     gradient = objective.gradient
@@ -146,7 +154,7 @@ def _linearised(objective: SceneObjective, settings: ProbeSettings, report: Prog
     objective.approximate_blocks  # noqa: B018 (cached; its kernels compile in this stage)
     if settings.block_ssim_window or not settings.trace_samples:
         _compile_blocks(objective)
-    return _Point(objective, hessian, CountingOperator(hessian), settings, gradient, value)
+    return _Point(objective, hessian, CountingOperator(operator), settings, gradient, value, ranks)
 
 
 def _compile_blocks(objective: SceneObjective) -> None:
@@ -183,6 +191,7 @@ def _all_stages(
         depth = kept.run("depth", Depth, partial(_depth, at, settings.depth))
     shares = kept.run("block shares", list[BlockShare], partial(_shares, at))
     matvecs, spared = (sum(both) for both in zip(of_checks, kept.counts, strict=True))
+    spared = int(at.ranks.sum(torch.tensor(spared)))
     wanted = {"density": settings.density_matvecs, "finite probe": settings.probe_steps, "depth": settings.depth}
     return Measured(
         value=at.value,
@@ -209,7 +218,7 @@ def _all_stages(
 
 def _left_out(at: _Point, ends: EigenEnds, population: int) -> LeftOut:
     vectors = torch.cat([ends.largest.vectors[:, :2], ends.smallest.vectors[:, :1]], dim=1)
-    return LeftOut(population, at.objective.losses, at.hessian.by_view(vectors))
+    return LeftOut(population, at.objective.losses, SceneHessian(at.objective).by_view(vectors))
 
 
 def _traces(
@@ -319,7 +328,7 @@ def _plane(
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
-    workers = thread_count() if at.objective.ranks.size == 1 and backend_of(center) is CPU else 1
+    workers = thread_count() if backend_of(center) is CPU else 1
     most = inf if settings.slice_plane else 1  # 1: the two axes alone
     accuracy = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most)
     # E^T H E of Ritz vectors E is diagonal: no product is needed

@@ -1,13 +1,10 @@
 """The record (`analysis.records.records.ProbeRecord`) and the arrays of a probe's results."""
 
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from math import isfinite, nan
-from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 from msgspec import UNSET, UnsetType, convert
 from torch import Tensor
@@ -16,21 +13,15 @@ from analysis.measures.gradient_check import ENOUGH
 from analysis.measures.localization import conditions, localize, mass_shares
 from analysis.probe.measured import LeftOut, Measured, PlaneSlice
 from analysis.records import schema
-from analysis.records.provenance import Origin, Provenance, provenance
-from analysis.records.records import Check, Counts, ProbeRecord, Skip
+from analysis.records.provenance import Provenance
+from analysis.records.records import Check, Counts, ProbeRecord, Skip, counts_of, objective_of
 from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, eigenvalue_ratio
 from landscape.results import Bracket, finite_or_none, sampling_error
 from landscape.slices.finite_probe import FiniteProbe
-from landscape.slices.slice import Slice as Grid
-from splat.backend.cpu.simd import lanes_of
-from splat.curvature.objective import ActiveCounts, SceneObjective
+from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.shares import BlockShare
 from splat.curvature.traces import curvature_scale
-from splat.losses.reference import LossSettings
-from splat.scenes.scene import Scene
-from splat.training.checkpoint import Checkpoint
-from splat.training.origin.fingerprint import Fingerprint
 
 NAMES = ("e₁", "e₂")  # of the slice's directions
 
@@ -79,53 +70,8 @@ def probe_arrays(found: Measured) -> dict[str, dict[str, np.ndarray]]:
     if found.density is not None:
         arrays["spectrum"] |= dict(zip(("nodes", "weights"), (x.numpy() for x in found.density.table()), strict=True))
     if found.plane is not None:
-        arrays["slice"] = grid_arrays(found.plane.slice)
+        arrays["slice"] = found.plane.slice.arrays()
     return arrays
-
-
-def grid_arrays(grid: Grid) -> dict[str, np.ndarray]:
-    """The arrays of a slice."""
-    known = dict(zip("xy", grid.coordinates, strict=False))
-    known |= {"loss": grid.loss, "model": grid.model, "crossed": grid.discontinuous, "evaluated": grid.evaluated}
-    return {name: array.numpy() for name, array in known.items() if array is not None}
-
-
-def provenance_of(
-    made: Fingerprint, path: Path, command: Sequence[str], checkpoint: Checkpoint, scene: Scene
-) -> Provenance:
-    """Provenance of a record of these numbers.  path: of the checkpoint; command: as typed."""
-    return provenance(
-        made.question["seed"],
-        lanes=lanes_of(np.float32),
-        checkpoint=str(path),
-        origin=UNSET if checkpoint.origin is None else convert(checkpoint.origin, Origin),
-        scene=scene.name,
-        scene_folder=str(scene.root),
-        views=list(checkpoint.scene.train),
-        iteration=checkpoint.training.step,
-        dtype=str(checkpoint.training.gaussians.flat.dtype).removeprefix("torch."),
-        threads=torch.get_num_threads(),
-        command=shlex.join(command),
-        fingerprint=made,
-    )
-
-
-def loss_name(loss: LossSettings) -> str:
-    """The loss as a formula in words.
-
-    >>> loss_name(LossSettings()), loss_name(LossSettings("charbonnier", 0.0, eps=0.001))
-    ('0.8 L1 + 0.2 (1 − SSIM)', 'Charbonnier (eps 0.001)')
-    >>> loss_name(LossSettings(opacity_reg=0.01, scale_reg=0.02))
-    '0.8 L1 + 0.2 (1 − SSIM) + 0.01 mean opacity + 0.02 mean scale'
-    """
-    pixel = {"l1": "L1", "l2": "L2", "charbonnier": f"Charbonnier (eps {loss.eps:g})"}[loss.pixel]
-    terms = [pixel if loss.pixel_weight == 1 else f"{loss.pixel_weight:g} {pixel}"]
-    if loss.ssim_weight:
-        windows = " of windows within the image" if loss.border == "valid" else ""
-        terms.append(f"{loss.ssim_weight:g} (1 − SSIM{windows})")
-    regularizers = {"opacity": loss.opacity_reg, "scale": loss.scale_reg}
-    terms += [f"{weight:g} mean {name}" for name, weight in regularizers.items() if weight]
-    return " + ".join(terms)
 
 
 def left_out_note(views: int, population: int | None) -> list[str]:
@@ -139,20 +85,6 @@ def left_out_note(views: int, population: int | None) -> list[str]:
         "by a median of 72% to 76% from 2 of them, 48% to 52% from 3, 17% to 44% from 4, 5% to 12% from 8; where all cameras "
         "face one way by at most 3%); for the other numbers it is not known"
     ]
-
-
-def objective_of(
-    objective: SceneObjective, value: float, gradient_norm: float, views_error: schema.Maybe[float | None] = UNSET
-) -> schema.Objective:
-    return schema.Objective(
-        loss=loss_name(objective.loss_settings),
-        sizes=[(view.camera.width, view.camera.height) for view in objective.views],
-        background=tuple(objective.background.tolist()),
-        operator="hessian",
-        value=value,
-        gradient_norm=gradient_norm,
-        views_error=views_error,
-    )
 
 
 def index_of(bracket: Bracket) -> schema.Index:
@@ -280,23 +212,6 @@ def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
     )
 
 
-def counts_of(active: ActiveCounts, views_of: int | None, **work: int) -> Counts:
-    """Counts of a record.  views_of: None where no views were left out; work: the other fields of `Counts`."""
-    return Counts(
-        gaussians=active.gaussians,
-        visible_gaussians=active.active_gaussians,
-        skipped_gaussians=active.gaussians - active.active_gaussians,
-        parameters=active.parameters,
-        active_parameters=active.active_parameters,
-        skipped_quaternion_lengths=active.radial_quaternions,
-        sh_degree_stored=active.sh_degree,
-        sh_degree_active=active.active_sh_degree,
-        views=active.views,
-        views_of=UNSET if views_of is None else views_of,
-        **work,
-    )
-
-
 def _counts(found: Measured, objective: SceneObjective) -> Counts:
     evaluations = 0 if found.plane is None else found.plane.slice.evaluations
     evaluations += sum(each.evaluations for each in (found.rendered.ends if found.rendered else ()) if each)
@@ -318,16 +233,12 @@ def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, fl
     """
     counts, probes = objective.counts, [trace.probes for trace in found.traces.values()]
 
-    def total(count: int) -> int:
-        """Sum over the views of all processes."""
-        return int(objective.ranks.sum(torch.tensor(count)))
-
     products = {
         "gaussians_out_of_sight": counts.gaussians - counts.active_gaussians,
         "sh_bands_not_in_use": (counts.sh_degree + 1) ** 2 - (counts.active_sh_degree + 1) ** 2,
-        "entries_behind_opaque_fronts": total(sum(view.intersections_behind for view in objective.linearized)),
-        "tiles_of_zero_cotangent": total(sum(view.dark_tiles for view in objective.linearized)),
-        "products_of_views_not_concerned": total(found.spared),
+        "entries_behind_opaque_fronts": sum(view.intersections_behind for view in objective.linearized),
+        "tiles_of_zero_cotangent": sum(view.dark_tiles for view in objective.linearized),
+        "products_of_views_not_concerned": found.spared,
     }
 
     def undone(count: int, made: int, seconds: float) -> Skip:

@@ -3,16 +3,22 @@
 import importlib.metadata
 import os
 import platform
+import shlex
 import subprocess
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from msgspec import UNSET, Meta, Struct
+import numpy as np
+from msgspec import UNSET, Meta, Struct, convert
 
 from analysis.records.schema import Maybe, NonNegative, Number
 from landscape.errors import InputError
 from splat.training.origin.fingerprint import Fingerprint
+
+if TYPE_CHECKING:
+    from splat.training.origin.subject import Subject
 
 PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib", "pyvista", "plotly")
 
@@ -108,6 +114,29 @@ def provenance(seed: int, *, lanes: int | None = None, **more: Any) -> Provenanc
     """Provenance of a run here and now.  lanes: as in `Machine`; more: the other fields of `Provenance`."""
     created = datetime.now(UTC).isoformat(timespec="seconds")
     return Provenance(created=created, seed=seed, versions=versions(), machine=machine(lanes), commit=commit(), **more)
+
+
+def provenance_of(made: Fingerprint, subject: "Subject", command: Sequence[str]) -> Provenance:
+    """Provenance of a record of these numbers.  command: as typed."""
+    import torch
+
+    from splat.backend.cpu.simd import lanes_of
+
+    checkpoint = subject.checkpoint
+    return provenance(
+        made.question["seed"],
+        lanes=lanes_of(np.float32),
+        checkpoint=str(subject.path),
+        origin=UNSET if checkpoint.origin is None else convert(checkpoint.origin, Origin),
+        scene=subject.scene.name,
+        scene_folder=str(subject.scene.root),
+        views=list(checkpoint.scene.train),
+        iteration=checkpoint.training.step,
+        dtype=str(checkpoint.training.gaussians.flat.dtype).removeprefix("torch."),
+        threads=torch.get_num_threads(),
+        command=shlex.join(command),
+        fingerprint=made,
+    )
 
 
 def versions() -> dict[str, str | None]:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
 from msgspec import UNSET, Struct, field
@@ -23,6 +23,10 @@ from analysis.records.provenance import Provenance
 from analysis.records.schema import Count, Maybe, Number
 from landscape.errors import InputError
 from splat.model.untrusted import beside, locked, read_arrays, replacing, write_atomically
+from splat.training.origin.fingerprint import Fingerprint
+
+if TYPE_CHECKING:
+    from splat.curvature.objective import ActiveCounts, SceneObjective
 
 ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
@@ -303,3 +307,55 @@ def require_replaceable(folder: Path, mark: str = ProbeRecord.FILE) -> None:
         )
     if folder.exists() and not folder.is_dir():
         raise InputError(f"expected a folder to write a record to, got the file {folder}; move it away")
+
+
+def recorded_probe(folder: Path, asked: Fingerprint, notes: list[str]) -> Record[ProbeRecord] | None:
+    """The probe recorded in a folder, if any, where it is of the checkpoint, the views and the loss that are asked for, and has
+    its eigenvectors.
+
+    notes: is told where there is a record that cannot be read, or one of another.
+    """
+    if not (folder / ProbeRecord.FILE).is_file():
+        return None
+    try:
+        record = read_record(folder, ProbeRecord)
+    except (FileNotFoundError, InputError) as error:
+        notes.append(f"eigenvectors were not taken from the probe: {error}")
+        return None
+    found = record.data.provenance.fingerprint
+    if apart := asked.apart_from(found) if found else "origin":
+        notes.append(f"eigenvectors were not taken from {folder}: it is a probe of another {apart}; probe again")
+        return None
+    return record if "largest" in record.arrays.get("eigenvectors", {}) else None
+
+
+def objective_of(
+    objective: "SceneObjective", value: float, gradient_norm: float, views_error: Maybe[Number] = UNSET
+) -> schema.Objective:
+    """What a record says of its loss."""
+    return schema.Objective(
+        loss=objective.loss_settings.formula,
+        sizes=[(view.camera.width, view.camera.height) for view in objective.views],
+        background=tuple(objective.background.tolist()),
+        operator="hessian",
+        value=value,
+        gradient_norm=gradient_norm,
+        views_error=views_error,
+    )
+
+
+def counts_of(active: "ActiveCounts", views_of: int | None, **work: int) -> Counts:
+    """Counts of a record.  views_of: None where no views were left out; work: the other fields of `Counts`."""
+    return Counts(
+        gaussians=active.gaussians,
+        visible_gaussians=active.active_gaussians,
+        skipped_gaussians=active.gaussians - active.active_gaussians,
+        parameters=active.parameters,
+        active_parameters=active.active_parameters,
+        skipped_quaternion_lengths=active.radial_quaternions,
+        sh_degree_stored=active.sh_degree,
+        sh_degree_active=active.active_sh_degree,
+        views=active.views,
+        views_of=UNSET if views_of is None else views_of,
+        **work,
+    )

@@ -32,8 +32,9 @@ from analysis.runs.compared import checkpoint_path, compared, probe, probe_comma
 from analysis.runs.options import CompareOptions
 from analysis.runs.seeds import Group, grouped, groups_of, identical, sayings
 from landscape.errors import InputError
-from splat.training.checkpoint import Checkpoint, write_atomically
+from splat.training.checkpoint import write_atomically
 from splat.training.origin.fingerprint import changes, in_short
+from splat.training.origin.subject import Checkpoint
 
 PAGE, TABLE = "compare.html", "compare.csv"
 ASKED = ("settings.", "seed", "objective.of")  # of the question: cautions have its other parts

@@ -20,7 +20,7 @@ from analysis.records.run_files import ENDS, Scores
 from analysis.records.schema import INDICES, Anisotropy, Depth, Effect, End, Index, Operator, Trace
 from analysis.records.tables import OPERATOR_NAMES, Cell, bracketed, factor
 from splat.model.typed import leaves
-from splat.training.checkpoint import Checkpoint
+from splat.training.origin.subject import Checkpoint
 from splat.training.state import MethodSettings
 
 FAMILIES = "per_attribute"  # a section that only the page and the file show

@@ -9,8 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from analysis.console.options import ForeignOptions
-from analysis.probe.command import opened, run_probe
+from analysis.probe.command import run_probe
 from analysis.probe.options import ProbeOptions
 from analysis.records.provenance import Provenance, require_own
 from analysis.records.records import ProbeRecord, read_record
@@ -18,9 +17,10 @@ from analysis.records.run_files import CHECKPOINT, METRICS, Scores, read_scores
 from analysis.runs.options import CompareOptions
 from analysis.runs.sweep.sweep_file import arguments
 from landscape.errors import InputError
-from splat.training.checkpoint import Checkpoint, load_checkpoint, open_checkpoint
+from splat.training.checkpoint import load_checkpoint, open_checkpoint, open_subject
 from splat.training.origin.fingerprint import changes
-from splat.training.origin.foreign import Foreign
+from splat.training.origin.options import Foreign
+from splat.training.origin.subject import Checkpoint
 
 PROBE, RENDER = "probe", ("objective.render.", "objective.similarity", "objective.centred", "objective.background")
 AGAIN = "repeat the training's command with --resume, which scores again"
@@ -50,9 +50,9 @@ def compared(run: Path, options: CompareOptions) -> Checkpoint:
         return load_checkpoint(run / CHECKPOINT)
     folder = probe_folder(run)
     made = _made(folder)
-    if made and made.origin and made.scene_folder and (options.scene, options.foreign) == (None, ForeignOptions()):
-        return open_checkpoint(run, _as_probed(made), folder.with_name(f"{folder.name}-mismatch.png"))
-    return opened(run, options.scene, replace(options.foreign, max_views=None), folder)[0]
+    if made and made.origin and made.scene_folder and options.foreign == Foreign():
+        return open_checkpoint(run, _as_probed(made), folder, made.views)
+    return open_subject(run, replace(options.foreign, max_views=None), folder).checkpoint
 
 
 def _as_probed(made: Provenance) -> Foreign:
@@ -60,7 +60,6 @@ def _as_probed(made: Provenance) -> Foreign:
     origin, loss = made.origin, made.origin.preset.loss
     return Foreign(
         scene=Path(made.scene_folder),
-        train_list=tuple(made.views or ()),
         trained_by=origin.trained_by,
         images=origin.images,
         downscale=origin.downscale,
@@ -87,10 +86,10 @@ def probed(run: Path, checkpoint: Checkpoint) -> bool:
 
 
 def _probing(run: Path, options: CompareOptions, loss: Loss) -> ProbeOptions:
-    fewer = replace(ForeignOptions(), max_views=options.foreign.max_views)
+    fewer = Foreign(max_views=options.foreign.max_views)
     asked = ProbeOptions(checkpoint_path(run), device=options.device, loss=loss, foreign=fewer)
     if run.is_file():
-        asked = replace(asked, scene=options.scene, out=probe_folder(run), foreign=options.foreign)
+        asked = replace(asked, out=probe_folder(run), foreign=options.foreign)
     return asked
 
 

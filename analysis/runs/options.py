@@ -4,9 +4,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
-from analysis.console.options import DeviceName, ForeignOptions, Unset
+from analysis.console.options import Device, OtherTools
+from splat.training.origin.options import Foreign
 
 
 @dataclass(frozen=True)
@@ -30,13 +31,13 @@ class SweepOptions:
     [methods."asp only"]
     method = "stablegs"
     set = { vsp_weight = 0 }"""
-    out: Unset[Path] = None
+    out: Path | None = None
     """Folder of the runs and tables.  Default: the file's."""
     only: UseAppendAction[tuple[str, ...]] = ()
     """Run these cells alone, by SCENE/METHOD/SEED or the beginning of it, such as fern/3dgs; may be repeated."""
     jobs: int = 1
     """Runs at once, each on its share of the processors."""
-    probe: FlagCreatePairsOff[bool] = False
+    probe: bool = False
     """Also probe every run after its training, as a table [probe] in the file does, which may hold options of the probe."""
 
 
@@ -46,7 +47,7 @@ class TrajectoryOptions:
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
     """Folders that landscape train --probe-every wrote."""
-    out: Unset[Path] = None
+    out: Path | None = None
     """Folder of the table and the picture.  Default: trajectory, in the folder that holds all runs."""
 
 
@@ -59,12 +60,9 @@ class CompareOptions:
     A folder whose sub-folders are runs, such as OUT/SCENE/METHOD of a sweep, stands for all its seeds: mean and spread."""
     group: UseAppendAction[tuple[str, ...]] = ()
     """LABEL=RUN,RUN: runs that differ in their seed alone, as one; may be repeated."""
-    out: Unset[Path] = None
+    out: Path | None = None
     """Folder of the page, the table and the pictures.  Default: compare, in the folder that holds all runs."""
-    probe: FlagCreatePairsOff[bool] = False
+    probe: bool = False
     """Probe the runs that have no record of their checkpoint yet."""
-    device: DeviceName = "auto"
-    """Where to probe.  auto: on the GPU where there is one that can be used, else on the CPU."""
-    scene: Unset[Path] = None
-    """Folder of the scene of other tools' files; those that were probed are opened as they were then."""
-    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+    device: Device = "auto"
+    foreign: OtherTools = field(default_factory=Foreign)

@@ -17,7 +17,7 @@ from analysis.records.run_files import CHECKPOINT
 from analysis.records.tables import Cell
 from analysis.runs.compare_table import Entry, Row
 from landscape.errors import InputError
-from splat.training.checkpoint import Checkpoint
+from splat.training.origin.subject import Checkpoint
 
 TOLD = ("held-out views", "trace", "spectrum", "anisotropy")  # sections whose differences are told
 MORE = {"top mass": 1, "participation ratio": -1}  # the sign of an index where curvature is less even

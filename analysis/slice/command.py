@@ -29,24 +29,14 @@ from analysis.console.plain import say
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.measures.memory import expected_peak, size_of
-from analysis.probe.command import opened, scene_objective
+from analysis.measures.units import RISE
 from analysis.probe.measurement import evaluation
-from analysis.probe.record import provenance_of
 from analysis.records.findings import of_slice, resolved
-from analysis.records.provenance import require_seed
+from analysis.records.provenance import provenance_of, require_seed
 from analysis.records.quantities import apart, measured, quantity
-from analysis.records.records import SliceRecord, record_folder, require_replaceable
+from analysis.records.records import SliceRecord, record_folder, recorded_probe, require_replaceable
 from analysis.records.schema import FiniteProbe
-from analysis.slice.directions import (
-    RISE,
-    Direction,
-    Shape,
-    at_right_angles,
-    axis_of,
-    cosine,
-    find_directions,
-    recorded_probe,
-)
+from analysis.slice.directions import Direction, Shape, at_right_angles, axis_of, cosine, find_directions
 from analysis.slice.options import SliceOptions
 from analysis.slice.record import Found, LeftOut, slice_arrays, slice_record
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
@@ -59,8 +49,9 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
 from splat.model.untrusted import KeptArrays
-from splat.training.checkpoint import Checkpoint, load_checkpoint
+from splat.training.checkpoint import load_checkpoint, open_subject
 from splat.training.origin.fingerprint import Fingerprint, state_of
+from splat.training.origin.subject import Checkpoint
 
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
@@ -81,10 +72,11 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
     require_replaceable(out, SliceRecord.FILE)
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
+        subject = open_subject(options.checkpoint, options.foreign, out)
+        checkpoint = subject.checkpoint
         checkpoint.training.move(device)
         others = [_other_end(checkpoint, path) for path in options.others]
-        objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
+        objective = subject.objective(keep_unseen=bool(others))
         expected_peak(objective)  # raises MemoryError where it cannot fit
         ends = [state_of(checkpoint.training.gaussians.with_flat(other), 0) for other in others]
         made = checkpoint.fingerprint(_asked(options, settings) | {"others": ends}, options.seed)
@@ -99,7 +91,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
             if unfinished.is_dir():
                 say(f"what was rendered is kept; to continue: {shlex.join(command)}", console=console)
             raise
-        origin = provenance_of(made, options.checkpoint, command, checkpoint, scene)
+        origin = provenance_of(made, subject, command)
         origin.other = ", ".join(map(str, options.others)) or None
         data = slice_record(found, objective, notes + checkpoint.assumptions, origin)
         objective.release()  # for the memory of the processes that draw

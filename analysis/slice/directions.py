@@ -16,13 +16,12 @@ falling.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from analysis.records.records import ProbeRecord, Record, read_record
+from analysis.measures.units import UNITS
 from analysis.slice.options import Along
 from landscape import (
     EigenSettings,
@@ -39,11 +38,8 @@ from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
 from landscape.results import Progress
 from splat.curvature.objective import SceneObjective
-from splat.training.origin.fingerprint import Fingerprint
 
-RISE = 0.001  # of the loss, within a curvature unit
-UNITS = 3.0  # default radii: in curvature units, ...
-SHARE = 0.001  # ... as a share of the parameters' sizes, ...
+SHARE = 0.001  # default radii: as a share of the parameters' sizes, ...
 BEYOND = 0.5  # ... beyond a line's ends
 PLANES = {"eigenvectors", "random"}  # kinds that are two directions, where no other is named
 RTOL, MAX_MATVECS = 1e-3, 300  # of the eigenvectors
@@ -210,23 +206,3 @@ def _measured(
     product, exact = operator.apply(vectors).double(), vectors.double()
     values = (exact * product).sum(dim=0)
     return values, (product - values * exact).norm(dim=0)
-
-
-def recorded_probe(folder: Path, asked: Fingerprint, notes: list[str]) -> Record[ProbeRecord] | None:
-    """The probe recorded in a folder, if any, where it is of the checkpoint, the views and the loss that are asked for, and has
-    its eigenvectors.
-
-    notes: is told where there is a record that cannot be read, or one of another.
-    """
-    if not (folder / ProbeRecord.FILE).is_file():
-        return None
-    try:
-        record = read_record(folder, ProbeRecord)
-    except (FileNotFoundError, InputError) as error:
-        notes.append(f"eigenvectors were not taken from the probe: {error}")
-        return None
-    found = record.data.provenance.fingerprint
-    if apart := asked.apart_from(found) if found else "origin":
-        notes.append(f"eigenvectors were not taken from {folder}: it is a probe of another {apart}; probe again")
-        return None
-    return record if "largest" in record.arrays.get("eigenvectors", {}) else None

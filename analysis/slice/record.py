@@ -9,10 +9,9 @@ from jaxtyping import Float, Float64
 from msgspec import convert
 from torch import Tensor
 
-from analysis.probe.record import counts_of, grid_arrays, objective_of
 from analysis.records import schema
 from analysis.records.provenance import Provenance
-from analysis.records.records import SliceRecord
+from analysis.records.records import SliceRecord, counts_of, objective_of
 from analysis.slice.directions import Direction
 from landscape import FiniteProbe, Slice
 from landscape.results import sampling_error
@@ -91,4 +90,4 @@ def slice_record(found: Found, objective: SceneObjective, notes: list[str], made
 
 def slice_arrays(found: Found) -> dict[str, dict[str, np.ndarray]]:
     """The arrays, by file (`analysis.records.records.ARRAYS`)."""
-    return {"slice": grid_arrays(found.slice), "directions": {"vectors": found.vectors.cpu().numpy()}}
+    return {"slice": found.slice.arrays(), "directions": {"vectors": found.vectors.cpu().numpy()}}

@@ -48,7 +48,7 @@ from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, read_names, split_scene, usual_views
 from splat.scenes.view import View
-from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
+from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
 from splat.training.densify import DensifySettings
 from splat.training.loop import prepare, train
 from splat.training.methods.methods import METHODS
@@ -56,6 +56,7 @@ from splat.training.methods.protocols import presets
 from splat.training.origin.fingerprint import Fingerprint
 from splat.training.origin.frames import posed, shift_to_origin
 from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import Checkpoint
 from splat.training.score.evaluate import have_masks
 from splat.training.start import Source, initial_gaussians
 from splat.training.state import TrainConfig, Training

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-from analysis.console.options import TrainerOptions
 from analysis.console.overrides import assignments
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError
@@ -12,22 +11,13 @@ from splat.model.gaussians import Gaussians
 from splat.scenes.scene import Scene
 from splat.scenes.splits import Split
 from splat.training.checkpoint import open_checkpoint
-from splat.training.origin.foreign import REGULARIZERS, Foreign
+from splat.training.origin.foreign import REGULARIZERS
 from splat.training.origin.frames import posed
+from splat.training.origin.options import Foreign
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig
 
 Planned = tuple[Scene, Split, TrainConfig, SceneReference]
-
-
-def of_trainer(ask: TrainerOptions) -> Foreign:
-    """Options on the trainer of another tool's file."""
-    return Foreign(
-        trained_by=ask.trained_by,
-        antialiased=ask.antialiased or None,
-        opacity_reg=ask.opacity_reg,
-        scale_reg=ask.scale_reg,
-    )
 
 
 def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Planned, Gaussians | None]:
@@ -38,7 +28,7 @@ def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Pl
     InputError where the checkpoint is refused, and where --set changes its renderer or --trained-by has no file to speak of.
     """
     scene, split, config, reference = plan
-    asked = of_trainer(options.foreign)
+    asked, train = Foreign(**vars(options.foreign)), None
     if options.from_ is None:
         if asked != Foreign():
             raise InputError(
@@ -53,9 +43,9 @@ def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Pl
     if twice := [name for name in regularized if f"loss.{name}" in changes]:
         raise InputError(f"expected --{twice[0].replace('_', '-')} or --set loss.{twice[0]}, got both; leave one out")
     if is_foreign(options.from_):
-        place = {"scene": options.scene, "images": options.images, "downscale": options.downscale}
-        asked = replace(asked, train_list=tuple(split.train), **place)
-    found = open_checkpoint(options.from_, asked, out.with_name(f"{out.name}-mismatch.png"))
+        asked = replace(asked, scene=options.scene, images=options.images, downscale=options.downscale)
+        train = split.train
+    found = open_checkpoint(options.from_, asked, out, train)
     world = found.scene
     scene = posed(scene, world.similarity, centred=world.centred)
     reference = replace(reference, similarity=world.similarity, centred=world.centred)

@@ -63,8 +63,9 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, block_traces, exact_traces
 from splat.scenes.view import View
-from splat.training.checkpoint import Checkpoint, write_atomically
+from splat.training.checkpoint import write_atomically
 from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import Checkpoint
 from splat.training.state import Training
 
 START = "start"

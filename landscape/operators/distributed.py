@@ -20,7 +20,7 @@ from typing import TypeVar
 
 import torch
 import torch.distributed as dist
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from landscape.errors import InputError
@@ -70,19 +70,6 @@ class Ranks:
     def sum(self, x: Shaped[Tensor, "..."]) -> Shaped[Tensor, "..."]:
         """The sum of x over ranks, with the same bits on each."""
         return self._reduced(x, dist.ReduceOp.SUM)
-
-    def any(self, mask: Bool[Tensor, "..."]) -> Bool[Tensor, "..."]:
-        """True where the mask of at least one rank is."""
-        return self._reduced(mask.to(torch.uint8), dist.ReduceOp.MAX).bool()
-
-    def gather(self, x: Shaped[Tensor, "..."]) -> list[Shaped[Tensor, "..."]]:
-        """x of every rank, in the order of ranks.  Its shape and dtype must be the same on all."""
-        if self.size == 1:
-            return [x]
-        parts = [torch.empty_like(x, device=self.device) for _ in range(self.size)]
-        with _exchange():
-            dist.all_gather(parts, x.to(self.device).contiguous())
-        return [part.to(x.device) for part in parts]
 
     def require_same(self, name: str, value: object) -> None:
         """Raise InputError on all ranks unless str(value) is the same on each."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
+import numpy as np
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
@@ -87,6 +88,12 @@ class Slice:
     def share_beyond(self) -> float:
         """The largest share of interpolated points with errors above error_seen, with 95% confidence."""
         return 0.0 if self.evaluated.all() else share_beyond(self.holdout.numel(), self.looks)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """x, y: coordinates (n,); of each point the loss, the model, whether it was evaluated, and in another smooth piece."""
+        known = dict(zip("xy", self.coordinates, strict=False))
+        known |= {"loss": self.loss, "model": self.model, "crossed": self.discontinuous, "evaluated": self.evaluated}
+        return {name: array.numpy() for name, array in known.items() if array is not None}
 
     def record(self) -> dict[str, Any]:
         return {

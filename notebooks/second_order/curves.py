@@ -17,7 +17,7 @@ import pandas as pd
 from analysis.records.run_files import CHECKPOINT
 from landscape.errors import InputError
 from splat.scenes.view import View
-from splat.training.checkpoint import load_checkpoint
+from splat.training.checkpoint import load_checkpoint, open_subject
 from splat.training.score.evaluate import evaluate
 
 LOG, HISTORY = "train.csv", "history.csv"
@@ -57,11 +57,11 @@ def curve(run: Path) -> pd.DataFrame:
 
 
 def _views(path: Path) -> tuple[list[View], list[View]]:
-    loaded = load_checkpoint(path)
-    scene = loaded.load_scene(path)
-    if not loaded.scene.test:
+    subject = open_subject(path)
+    scene, views = subject.scene, subject.checkpoint.scene
+    if not views.test:
         raise InputError(f"expected held-out views in {path}, got none")
-    return scene.load(loaded.scene.train), scene.load(loaded.scene.test)
+    return scene.load(views.train), scene.load(views.test)
 
 
 def _passes(run: Path) -> "pd.Series | None":

@@ -142,7 +142,7 @@ def _across(r: Float64[Tensor, "n w 1"], B: Float64[Tensor, "n w w"]) -> Float64
 def _kept_share(objective: SceneObjective) -> Float64[Tensor, " n"]:
     """(1 - rho) / (1 - rho_1) of each Gaussian, rho averaged over the views that draw it."""
     views = torch.stack([_blurred_share(objective, view.camera) for view in objective.views])
-    rho, drawn = objective.mean_over_views(views.sum(dim=0))
+    rho, drawn = views.sum(dim=0) / len(views)
     return (1 - rho / drawn) / (1 - RHO_OF_A_PIXEL)
 
 

@@ -27,7 +27,6 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.errors import InputError
 from landscape.results import Progress
 from splat.backend.cpu.threads import over_batch
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, PerGaussianBlocks
@@ -82,7 +81,7 @@ FIELDS = {
 def scene_fields(objective: SceneObjective, progress: Progress | None = None) -> tuple[Values, list[Sight]]:
     """Every field of the active Gaussians, on the CPU, and how each view sees them; a pass over the pixels for each view.
 
-    InputError on a GPU, or where processes share the views.
+    InputError on a GPU.
 
     >>> from splat import SceneObjective, SyntheticSettings, synthetic_scene
     >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
@@ -91,8 +90,6 @@ def scene_fields(objective: SceneObjective, progress: Progress | None = None) ->
     >>> fields.keys() == FIELDS.keys(), len(sights), bool((fields["views"] >= 1).all())
     (True, 2, True)
     """
-    if objective.ranks.size > 1:
-        raise InputError("expected one process, got several that share the views; run without torchrun")
     gaussians = objective.active
     sights = [sight(gaussians, view.camera, objective.settings) for view in objective.views]
     hessian, gauss_newton = objective.block_diagonals(progress=progress)

@@ -4,8 +4,8 @@ H is the mean of the views' Hessians.  P projects out the directions in which L 
 that no view sees have already been left out by `SceneObjective`.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
-from itertools import islice
 
 import torch
 from jaxtyping import Float, Float64
@@ -22,10 +22,10 @@ MOST_RECORDED = 1 << 28
 
 
 class ViewSum:
-    """The sum of the Hessians, or Gauss-Newton parts, of this process's views: an operator of `landscape` on their device.
+    """The sum of the Hessians, or Gauss-Newton parts, of the views: an operator of `landscape` on their device.
 
-    count: number of views, from the first; all by default.  ssim_window: False for the pixel-diagonal of the
-    losses' l'' in place of l''.
+    indices: of the views that are summed; all by default.  ssim_window: False for the pixel-diagonal of the losses' l'' in
+    place of l''.
     spared: number of products of a view with a vector that were skipped so far, because the vector moves no Gaussian that the
     view draws (on a CPU).
     """
@@ -35,10 +35,11 @@ class ViewSum:
         objective: SceneObjective,
         *,
         gauss_newton: bool = False,
-        count: int | None = None,
+        indices: Sequence[int] | None = None,
         ssim_window: bool = True,
     ):
-        self.objective, self.gauss_newton, self.count, self.ssim_window = objective, gauss_newton, count, ssim_window
+        self.objective, self.gauss_newton, self.ssim_window = objective, gauss_newton, ssim_window
+        self.indices = range(len(objective.views)) if indices is None else indices
         self.dim, self.dtype, self.blocks = objective.active.flat.numel(), objective.active.flat.dtype, objective.blocks
         self.spared = 0
 
@@ -46,7 +47,7 @@ class ViewSum:
         require_vectors(V, self.dim, self.dtype)
         parts = [part.contiguous() for part in V.split(VECTORS, dim=1)]
         totals = [torch.zeros_like(part, dtype=self.dtype) for part in parts]
-        for view in islice(self.objective.linearized, self.count):
+        for view in map(self.objective.linearized.__getitem__, self.indices):
             product = view.ggn if self.gauss_newton else view.hvp
             for part, total in zip(parts, totals, strict=True):
                 if view.affects(part):
@@ -56,11 +57,12 @@ class ViewSum:
         return torch.cat(totals, dim=1) if len(totals) > 1 else totals[0]
 
     def forms(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:
-        """v . H_m v for each of this process's views m and each column v; 0 for views after the first `count`."""
+        """v . H_m v for each view m and each column v; 0 for views that are not summed."""
         found = torch.zeros(len(self.objective.views), V.shape[1], dtype=torch.float64)
-        for row, view in zip(found, islice(self.objective.linearized, self.count), strict=False):
+        for index in self.indices:
+            view = self.objective.linearized[index]
             product = view.ggn if self.gauss_newton else view.hvp
-            row += (V.double() * product(V, ssim_window=self.ssim_window)).sum(dim=0).cpu()
+            found[index] = (V.double() * product(V, ssim_window=self.ssim_window)).sum(dim=0).cpu()
         return found
 
 
@@ -68,13 +70,13 @@ class SceneHessian:
     """H of L, or its Gauss-Newton part J^T l'' J, on the complement of its exact null space: P H P.
 
     A `landscape` operator: `dim` = p, `blocks` (the attributes), `dtype`, and `apply(V)`, which gives its result on V's device.
-    Where processes share the views, all of them have to apply it to the same vectors (else ValueError).
 
     For the Hessian, P removes the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and
     the SH directions that no view sees; for Gauss-Newton, all directions that no view sees.  keep_null: P = 1 instead.
-    count: only the part of H due to so many views of each process, from the first.  ssim_window: see `ViewSum`.
+    indices: only the part of H due to these views, as for a `landscape.DistributedOperator`, which adds the parts of several
+    processes.  ssim_window: see `ViewSum`.
 
-    views: H without P, summed over this process's views.  projector: P.
+    views: H without P, summed over the views.  projector: P.
 
     >>> import torch
     >>> from splat import SceneObjective, SyntheticSettings, synthetic_scene
@@ -90,11 +92,11 @@ class SceneHessian:
         *,
         gauss_newton: bool = False,
         keep_null: bool = False,
-        count: int | None = None,
+        indices: Sequence[int] | None = None,
         ssim_window: bool = True,
     ):
         self.objective, self.gauss_newton, self.keep_null = objective, gauss_newton, keep_null
-        self.views = ViewSum(objective, gauss_newton=gauss_newton, count=count, ssim_window=ssim_window)
+        self.views = ViewSum(objective, gauss_newton=gauss_newton, indices=indices, ssim_window=ssim_window)
         self.dim, self.dtype, self.blocks = self.views.dim, self.views.dtype, self.views.blocks
 
     @cached_property
@@ -112,10 +114,9 @@ class SceneHessian:
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         require_vectors(V, self.dim, self.dtype)
-        self.objective.ranks.require_same_vectors(V)
         PV = self._argument(V)
         total = self._recordings(self.views.apply, PV) if self.recordable(V.shape[1]) else self.views.apply(PV)
-        return self.project(self.objective.mean_over_views(total)).to(V.device)
+        return self.project(total / len(self.objective.views)).to(V.device)
 
     def _argument(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """Vectors with the same H V as P V, at less cost than P."""
@@ -124,7 +125,7 @@ class SceneHessian:
 
     def by_view(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:
         """v . P H_m P v of every view's part of H and each column: their mean over the views is v . P H P v."""
-        return self.objective.of_all_views(self.views.forms(self._argument(V)))
+        return self.views.forms(self._argument(V))
 
     def recordable(self, vectors: int) -> bool:
         """Whether products with so many vectors are worth a CUDA graph: views are on a GPU, all kept, and small."""

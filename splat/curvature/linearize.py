@@ -212,7 +212,7 @@ class LinearizedView:
 
 
 class KeptViews:
-    """An iterable of linearized views: the first `kept` stay in memory, the others are linearized anew at every iteration.
+    """A sequence of linearized views: the first `kept` that are used stay in memory, others are linearized at each use.
 
     linearize: makes the view of an index.  count: number of views.  memory: bytes for kept views and the workspace of a product
     with VECTORS vectors; it decides `kept`, and no result.  `first`, the first view, is made at once and always kept; its size
@@ -230,13 +230,15 @@ class KeptViews:
         return self._count
 
     def __iter__(self) -> Iterator[LinearizedView]:
-        for index in range(self._count):
-            if index >= self.kept:
-                yield self._linearize(index)
-                continue
-            if index not in self._views:
-                self._views[index] = self._linearize(index)
-            yield self._views[index]
+        return map(self.__getitem__, range(self._count))
+
+    def __getitem__(self, index: int) -> LinearizedView:
+        if index in self._views:
+            return self._views[index]
+        view = self._linearize(index)
+        if len(self._views) < self.kept:
+            self._views[index] = view
+        return view
 
     def workspace(self, vectors: int) -> int:
         """Bytes that a product with so many vectors takes in the first view, VECTORS at a time."""

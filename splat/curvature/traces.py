@@ -254,10 +254,9 @@ def coupling_samples(
     seeds = torch.randint(2**62, (count,), generator=generator, device=generator.device).tolist()
     found = []
     for index, linearized in enumerate(objective.linearized):
-        view = objective.view_numbers[index]
-        generators = [torch.Generator(generator.device).manual_seed(seed + view) for seed in seeds]
+        generators = [torch.Generator(generator.device).manual_seed(seed + index) for seed in seeds]
         found.append(torch.stack(linearized.loss_curvatures(draw(index, generators, names).flatten(1))).cpu())
-    x, y = objective.of_all_views(torch.stack(found)).view(-1, 2, len(names), count).unbind(dim=1)
+    x, y = torch.stack(found).view(-1, 2, len(names), count).unbind(dim=1)
     return x, y
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints: the state of a training and a reference to its scene, in one file.
+"""Checkpoints: the state of a training and a reference to its scene, in one file; and the door to what is measured.
 
 The file is a `torch.save` of a dictionary of tensors and plain types; its keys are the fields of `_File` and `_Training`.  It
 is written atomically, and loaded with `weights_only=True`, so that nothing in it can run code, after a test of its checksums,
@@ -6,11 +6,10 @@ which torch omits.  The same training gives the same bytes.
 """
 
 import io
-import json
 import sys
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from math import inf
 from pathlib import Path
@@ -20,107 +19,23 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError, did_you_mean, lacks_memory
-from landscape.results import ShortRepr
-from splat.losses.reference import LossSettings
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.typed import MOST, Count, leaves, typed
-from splat.model.untrusted import is_of_the_system, loose_json, require_content, require_whole, write_atomically
-from splat.scenes.scene import Scene
-from splat.scenes.splits import spread_views
+from splat.model.untrusted import is_of_the_system, require_content, require_whole, write_atomically
 from splat.training.adam import Adam
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
-from splat.training.origin.fingerprint import Fingerprint, ViewData, changes, state_of
-from splat.training.origin.foreign import Foreign, foreign_training
-from splat.training.origin.frames import posed
-from splat.training.origin.scene_reference import SceneReference, data_of
+from splat.training.origin.foreign import foreign_training
+from splat.training.origin.options import OF_ALL, Foreign
+from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import Checkpoint, Subject
 from splat.training.state import Method, TrainConfig, Training
 
+FILE = "checkpoint.pt"  # of a run
 FORMAT, VERSION = "splat-landscape checkpoint", 3
 KIND = "expected a checkpoint written by landscape train"
 REMEDY = "take another copy of the file, or train anew"
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Checkpoint(ShortRepr):
-    """A saved training and its scene.
-
-    origin: what was assumed of another tool's file (`foreign_training`).  all_views: number of views that it was trained on,
-    where the scene names fewer (`thinned`).  changed: what is not as it was in the training, where that was accepted.
-    """
-
-    training: Training
-    scene: SceneReference
-    origin: dict[str, Any] | None = None
-    all_views: int | None = None
-    changed: tuple[str, ...] = ()
-
-    @property
-    def assumptions(self) -> list[str]:
-        """Sentences on what was assumed of another tool's file, and on what was accepted."""
-        changed = [f"not as in the training, and accepted: {each}" for each in self.changed]
-        if self.origin is None:
-            return changed
-        summary = "trained by {trained_by} ({trained_by_source}), training views: {views}; {psnr:.1f} dB on two of them"
-        return [summary.format(**self.origin), *self.origin["notes"], *changed]
-
-    @property
-    def state(self) -> str:
-        """Digest of the Gaussians, by which records are known to be its own."""
-        return state_of(self.training.gaussians, self.training.step)
-
-    def fingerprint(
-        self,
-        settings: Mapping[str, Any],
-        seed: int,
-        loss: LossSettings | None = None,
-        further: Mapping[str, ViewData] | None = None,
-    ) -> Fingerprint:
-        """What numbers of this checkpoint are about.
-
-        settings: of the command, that change them.  loss: the training's by default.  further: views beside the training's.
-        """
-        config, scene, gaussians = self.training.config, self.scene, self.training.gaussians
-        rounded = None if scene.similarity is None else [f"{value:.9g}" for row in scene.similarity for value in row]
-        objective = {
-            "loss": asdict(loss or config.loss),
-            "render": asdict(config.render),
-            "background": config.background,
-        }
-        objective |= {"views": scene.train, "of": self.all_views or len(scene.train)}
-        objective |= {"similarity": rounded, "centred": scene.centred, "dtype": str(gaussians.flat.dtype)}
-        trained = asdict(config) | {"extent": f"{self.training.extent:.9g}"}
-        question = leaves({"objective": objective, "training": trained, "settings": dict(settings), "seed": seed})
-        data = {name: scene.views[name] for name in scene.train} | dict(further or {})
-        return Fingerprint(data, loose_json(json.dumps(question, default=str)), self.state)  # as it is read again
-
-    def thinned(self, scene: Scene, count: int | None) -> "Checkpoint":
-        """The same with at most `count` of its training views, spread evenly over their cameras; None: all."""
-        if count is None or count >= len(self.scene.train):
-            return self
-        chosen = set(spread_views(scene.select(self.scene.train), count))
-        train = [name for name in self.scene.train if name in chosen]
-        return replace(self, scene=replace(self.scene, train=train), all_views=self.all_views or len(self.scene.train))
-
-    def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
-        """The scene of this checkpoint, which was read from path; see `with_scene`."""
-        return self.with_scene(path, scene)[1]
-
-    def with_scene(self, path: Path, folder: Path | None = None, *, accept: bool = False) -> tuple["Checkpoint", Scene]:
-        """The checkpoint with the views as they are now, and its scene, in the world of the Gaussians.
-
-        `scene.load(checkpoint.scene.train)` then gives the training views.  InputError that says what has changed since the
-        training, unless that is accepted; and as `SceneReference.load`.
-        """
-        reference = self.scene
-        scene = reference.load(path, self.training.config.background, folder)
-        now = data_of(scene, list(reference.views))
-        changed = tuple(changes(reference.views, now))
-        if not accept:
-            reference.require_unchanged(now, scene.root, "restore them, train anew, or go on with --accept-changed")
-        checkpoint = replace(self, scene=replace(reference, views=now), changed=changed)
-        return checkpoint, posed(scene, reference.similarity, centred=reference.centred)
 
 
 @dataclass(frozen=True)
@@ -220,16 +135,33 @@ def _interned(content: Any) -> Any:
     return sys.intern(content) if type(content) is str else content
 
 
-def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:
-    """The checkpoint of `load_checkpoint`, or another tool's file as one; ask, picture: see `foreign_training`.
+def open_subject(path: str | Path, foreign: Foreign = Foreign(), out: Path | None = None) -> Subject:
+    """A run, a checkpoint or another tool's file, with its scene: the door to all that can be measured.
 
-    InputError also where ask has options for another tool's file, and path is a checkpoint.
+    foreign: what the file does not say.  out: a refusal of another tool's file may leave a picture, OUT-mismatch.png; by
+    default beside the file.  Errors: see `load_checkpoint`, `foreign_training` and `Checkpoint.with_scene`.
+
+    >>> open_subject("nowhere/fern")
+    Traceback (most recent call last):
+        ...
+    FileNotFoundError: expected a checkpoint written by landscape train at nowhere/fern, found no such file
+    """
+    path = Path(path)
+    path = inside if (inside := path / FILE).is_file() else path
+    checkpoint = open_checkpoint(path, foreign, out or path)
+    subject = checkpoint.with_scene(path, foreign.scene, accept=foreign.accept_changed)
+    return replace(subject, checkpoint=subject.checkpoint.thinned(subject.scene, foreign.max_views))
+
+
+def open_checkpoint(path: Path, foreign: Foreign, out: Path, train: Sequence[str] | None = None) -> Checkpoint:
+    """The checkpoint of `load_checkpoint`, or another tool's file as one; the others: see `foreign_training`.
+
+    InputError also where something is said of another tool's file, and path is a checkpoint.
     """
     if is_foreign(path):
-        training, scene, origin = foreign_training(path, ask, picture)
-        return Checkpoint(training, scene, origin)
-    loaded = load_checkpoint(path)
-    if needless := [name for name, value in vars(ask).items() if value is not None and name != "scene"]:
+        return Checkpoint(*foreign_training(path, foreign, out.with_name(f"{out.name}-mismatch.png"), train))
+    loaded, usual = load_checkpoint(path), vars(Foreign())
+    if needless := [name for name, value in vars(foreign).items() if value != usual[name] and name not in OF_ALL]:
         raise InputError(
             f"expected no --{needless[0].replace('_', '-')} for {path}: a checkpoint of landscape train holds that already"
         )

@@ -19,7 +19,6 @@ from msgspec import Meta
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.operators.distributed import ALONE, Ranks
 from landscape.results import ShortRepr
 from splat.backend.memory import free_memory
 from splat.curvature.objective import SceneObjective
@@ -246,14 +245,10 @@ class TrainConfig(Settings):
         most = max(1, int(LOSSES * free_memory(like.device)) // each)
         return lru_cache(min(most, len(views)))(lambda index: self.loss_against(views[index].image, like))
 
-    def objective(
-        self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False, ranks: Ranks = ALONE
-    ) -> SceneObjective:
+    def objective(self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False) -> SceneObjective:
         """This loss, on this background, averaged over views: the objective whose Hessian is studied.  See `SceneObjective`."""
         background = self.background_colour(gaussians.flat.dtype)
-        return SceneObjective(
-            gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen, ranks=ranks
-        )
+        return SceneObjective(gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen)
 
 
 @dataclass(eq=False, repr=False)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from analysis.commands.map.command import measured_fields
+from analysis.commands.map.fields import measured_fields
 from analysis.commands.map.pictures import rendered
 from analysis.commands.view import viewer as view
 from analysis.commands.view.page import offline_page

@@ -10,12 +10,12 @@ from typing import Any, ClassVar
 
 import torch
 
-from analysis.console.options import ForeignOptions
-from analysis.probe.command import opened
 from splat.model.files.read import read_splats
 from splat.model.gaussians import Gaussians
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import open_subject
+from splat.training.origin.options import Foreign
 from tests.hostile import mutations
 from tests.hostile.broken import Format
 from tests.hostile.mutations import Random
@@ -60,10 +60,10 @@ class Model(Format):
 
     def use(self) -> None:
         listed = self.root / LIST if LIST in self.beside else None
-        ask = ForeignOptions(trained_by=self.trained_by, train_list=listed)
-        checkpoint, scene = opened(self.root / self.file, self.root / "scene", ask, self.root / "out")
-        flat = checkpoint.training.gaussians.flat
-        assert torch.isfinite(flat).all() and set(checkpoint.scene.train) <= {*scene.names}, "a scene that cannot be"
+        ask = Foreign(trained_by=self.trained_by, scene=self.root / "scene", train_list=listed)
+        subject = open_subject(self.root / self.file, ask)
+        flat, names = subject.checkpoint.training.gaussians.flat, subject.checkpoint.scene.train
+        assert torch.isfinite(flat).all() and set(names) <= {*subject.scene.names}, "a scene that cannot be"
         if self.by_bytes and self.has_checksum and self.changed == self.file:
             assert torch.equal(flat, self.flat), "other numbers than were written"
 

@@ -13,8 +13,9 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
-from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.loop import train
+from splat.training.origin.subject import Checkpoint
 from splat.training.state import Training
 from tests.hostile import mutations
 from tests.hostile.broken import Format

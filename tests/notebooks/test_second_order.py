@@ -51,7 +51,7 @@ def test_a_curve_has_loss_scores_and_passes_of_the_checkpoints(runs):
     assert list(pd.read_csv(runs / "still" / "3dgs" / "1" / CURVE)["passes"]) == [4, 8]
     path = run / "step-4" / "checkpoint.pt"
     loaded = load_checkpoint(path)
-    held_out, config = loaded.load_scene(path).load(loaded.scene.test), loaded.training.config
+    held_out, config = loaded.with_scene(path).scene.load(loaded.scene.test), loaded.training.config
     score = evaluate(loaded.training.gaussians, held_out, None, config.render).psnr
     assert rows["held_out"][1] == pytest.approx(score, rel=1e-6)
 

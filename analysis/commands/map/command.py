@@ -15,16 +15,14 @@ the images.
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
 import torch
-from msgspec import structs
 from rich.console import Console
 
+from analysis.commands.map.fields import ENDS, PROBE, Fields, in_words, measured_fields, require_known_field
 from analysis.commands.map.files import coloured_ply, csv_text, fields_ply, top_table
 from analysis.commands.map.pictures import error_shade, view_maps, write_maps
 from analysis.commands.options import MapOptions
@@ -32,59 +30,23 @@ from analysis.console.drawing import Draw
 from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.measures.fragility import fragility, fragility_sentences
-from analysis.measures.localization import masses
-from analysis.measures.steepest import End, steepest
-from analysis.probe.command import opened, scene_objective
-from analysis.probe.record import provenance_of
+from analysis.measures.steepest import steepest
 from analysis.records.json_files import json_text, plain
-from analysis.records.quantities import Shade, percent, quantity
+from analysis.records.provenance import provenance_of
+from analysis.records.quantities import Shade
 from analysis.records.records import record_folder, require_replaceable
 from analysis.records.run_files import MAP, Fragility, MapRecord, Panel, Steepest
-from analysis.slice.directions import recorded_probe
-from landscape.errors import InputError, did_you_mean
+from landscape.errors import InputError
 from landscape.results import Progress
 from splat.backend.cpu.threads import single_threaded
-from splat.curvature.fields import FIELDS, Field, Values, scene_fields
+from splat.curvature.fields import FIELDS, Field, Values
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
-from splat.render.sight import Sight
 from splat.scenes.view import View
-from splat.training.checkpoint import Checkpoint
-from splat.training.origin.fingerprint import Fingerprint
+from splat.training.checkpoint import open_subject
+from splat.training.origin.subject import Checkpoint
 
-ENDS = {"e1": "e₁", "e_min": "eₘᵢₙ"}  # fields of a probe's eigenvectors: the share of each in a Gaussian
 AXES = ("order_gap", "condition", "one_view")  # of fragility
-PROBE = "probe"
-
-
-@dataclass(frozen=True, eq=False)
-class Fields:
-    """Fields of the Gaussians in sight, with their kinds.  ends: of the spectrum that a probe recorded, by field."""
-
-    values: Values
-    kinds: Mapping[str, Field]
-    ends: Mapping[str, End]
-    sights: Sequence[Sight]
-
-    @property
-    def weight(self) -> np.ndarray:
-        return self.values["weight"].numpy()
-
-    def shade(self, name: str) -> Shade:
-        """The scale of a field; of `one_view` from 1 / views, equal weights, to 1."""
-        kind, views = self.kinds[name], len(self.sights)
-        shade = Shade.of(name, kind.words, kind.unit, kind.scale, self.values[name].numpy(), self.weight)
-        return structs.replace(shade, low=1 / views, high=1.0) if name == "one_view" and views > 1 else shade
-
-
-def in_words(kind: Field, value: float) -> str:
-    """A value of a field with its unit: whole numbers as such, shares in percent.
-
-    >>> [in_words(FIELDS[name], x) for name, x in (("views", 2.0), ("one_view", 1.0), ("weight", 2.5))]
-    ['2', '100%', '2.50 px']
-    """
-    whole = f"{value:,.0f}" if value.is_integer() else quantity(value)
-    return f"{percent(value) if kind.words.startswith('share') else whole} {kind.unit}".rstrip()
 
 
 def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
@@ -95,8 +57,9 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
     require_replaceable(out, MapRecord.FILE)
     stages = Stages(Console(stderr=True))
     with stages.stage("load"):
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
-        objective = scene_objective(checkpoint, scene)
+        subject = open_subject(options.checkpoint, options.foreign, out)
+        checkpoint = subject.checkpoint
+        objective = subject.objective()
         chosen = _chosen(options.draw, objective.views)
     made = checkpoint.fingerprint({"field": options.shown, "draw": options.draw}, options.seed)
     gaussians = checkpoint.training.gaussians
@@ -123,7 +86,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
             gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
             sentences=[f"{each.sentence} {each.rendered}" for each in shown] + fragility_sentences(fragile),
             steepest=shown, fragility=fragile, notes=notes + checkpoint.assumptions + _views_left_out(checkpoint),
-            provenance=provenance_of(made, options.checkpoint, command, checkpoint, scene),
+            provenance=provenance_of(made, subject, command),
         )  # fmt: skip
         _write(folder, data)
         with stages.stage("pictures"):
@@ -138,12 +101,6 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
     return 0
 
 
-def require_known_field(name: str, known: Sequence[str]) -> None:
-    """InputError unless --field names one of these."""
-    if name not in known:
-        raise InputError(f"expected --field {', '.join(known)}, got {name!r}{did_you_mean(name, known)}")
-
-
 def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
     """Indices of the views named, by file name, full name or index; by default all."""
     places = {view.name: i for i, view in enumerate(views)} | {Path(view.name).name: i for i, view in enumerate(views)}
@@ -153,27 +110,6 @@ def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
             f"expected --draw of a training view, 0 to {len(views) - 1} or a name such as {views[0].name}, got {unknown[0]!r}"
         )
     return sorted({places[name] for name in names}) or [*range(len(views))]
-
-
-def measured_fields(
-    objective: SceneObjective, probe: Path, made: Fingerprint, notes: list[str], report: Progress
-) -> Fields:
-    """Fields of the blocks and the views, and masses in the eigenvectors of the probe, where that is of what is asked for."""
-    values, sights = scene_fields(objective, report)
-    ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, made, notes)
-    if recorded is not None:
-        about, vectors = recorded.data.eigenvalues, recorded.arrays["eigenvectors"]
-        known = {
-            "e1": ("largest", about.max, "the steepest direction"),
-            "e_min": ("smallest", about.min, "the other end"),
-        }
-        for name, (group, end, title) in known.items():
-            if group in vectors and vectors[group].shape[1] and end.value:
-                title = "the most negative direction" if end.value < 0 else title
-                ends[name] = End(ENDS[name], title, torch.from_numpy(vectors[group][:, 0]), end.value)
-                values[name] = masses(ends[name].vector, objective.active)
-                kinds[name] = Field(f"share of {ENDS[name]}", "", "log")
-    return Fields(values, kinds, ends, sights)
 
 
 @single_threaded()

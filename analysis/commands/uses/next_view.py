@@ -19,9 +19,8 @@ from analysis.commands.uses.options import NextViewOptions
 from analysis.console.drawing import draw_or_say
 from analysis.console.plain import say
 from analysis.console.stages import Stages
-from analysis.probe.command import opened
-from analysis.probe.record import provenance_of
 from analysis.records.json_files import json_text, plain
+from analysis.records.provenance import provenance_of
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
@@ -30,8 +29,9 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.scenes.scene import Scene
-from splat.training.checkpoint import Checkpoint
+from splat.training.checkpoint import open_subject
 from splat.training.origin.scene_reference import data_of
+from splat.training.origin.subject import Checkpoint
 
 RECORD = "next-view.json"  # the file by which a folder of results is known
 
@@ -44,7 +44,8 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
     require_replaceable(out, RECORD)
     stages = Stages(Console(stderr=True))
     with stages.stage("load"):
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
+        subject = open_subject(options.checkpoint, options.foreign, out)
+        checkpoint, scene = subject.checkpoint, subject.scene
         candidates = _candidates(options.candidates, checkpoint, scene)
         if not 1 <= options.take <= len(candidates):
             raise InputError(f"expected --take of 1 to {len(candidates)}, the candidates, got {options.take}")
@@ -63,7 +64,7 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
             table = table.sort_values(["pick", options.by], ascending=[True, False])
             table.to_csv(folder / "gains.csv")
         judged = checkpoint.fingerprint({"take": options.take, "by": options.by}, 0, further=data_of(scene, candidates))
-        made = provenance_of(judged, options.checkpoint, command, checkpoint, scene)
+        made = provenance_of(judged, subject, command)
         (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     _conclude(table, options, out)

@@ -4,9 +4,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
-from analysis.console.options import CheckpointPath, Foreign, ForeignOptions, SceneFolder, Unset
+from analysis.console.options import CheckpointPath, OtherTools
+from splat.training.origin.options import Foreign
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class PruneOptions:
     opacity, size_opacity: as they are."""
     refine: int = 0
     """Steps of training after it, without density control."""
-    curve: FlagCreatePairsOff[bool] = False
+    curve: bool = False
     """Also score every --score at 0 to 95% removed, on training and held-out views, and after --curve-steps at 50% and 90%."""
     curve_steps: int = 300
     """Steps of training for the points of the curve with refinement; 0: none."""
@@ -31,10 +32,9 @@ class PruneOptions:
     """Gaussians that are really removed, one at a time, as the truth that scores are compared with."""
     seed: int = 0
     """Seed of the sample and of the refinement."""
-    scene: SceneFolder = None
-    out: Unset[Path] = None
+    out: Path | None = None
     """Folder of the results.  Default: prune, beside the checkpoint."""
-    foreign: Foreign = field(default_factory=ForeignOptions)
+    foreign: OtherTools = field(default_factory=Foreign)
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,9 @@ class NextViewOptions:
     by: str = "d"
     """By which gain: d (log-determinant of each Gaussian's block), t (trace), e (least eigenvalue), d_diagonal, or published
     (FisherRF's)."""
-    scene: SceneFolder = None
-    out: Unset[Path] = None
+    out: Path | None = None
     """Folder of the results.  Default: next-view, beside the checkpoint."""
-    foreign: Foreign = field(default_factory=ForeignOptions)
+    foreign: OtherTools = field(default_factory=Foreign)
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,6 @@ class UncertaintyOptions:
     """Random vectors for the variance of a pixel, which is known to a share of sqrt(2 / samples)."""
     seed: int = 0
     """Seed of these."""
-    scene: SceneFolder = None
-    out: Unset[Path] = None
+    out: Path | None = None
     """Folder of the results.  Default: uncertainty, beside the checkpoint."""
-    foreign: Foreign = field(default_factory=ForeignOptions)
+    foreign: OtherTools = field(default_factory=Foreign)

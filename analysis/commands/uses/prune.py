@@ -31,9 +31,8 @@ from analysis.console.drawing import draw_or_say
 from analysis.console.kept import Kept
 from analysis.console.plain import say
 from analysis.console.stages import Stages
-from analysis.probe.command import opened, scene_objective
-from analysis.probe.record import provenance_of
 from analysis.records.json_files import json_text, plain
+from analysis.records.provenance import provenance_of
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
@@ -43,8 +42,9 @@ from splat.losses.reference import LossSettings
 from splat.model.files.splat_ply import splat_ply
 from splat.model.gaussians import Gaussians
 from splat.scenes.view import View
-from splat.training.checkpoint import Checkpoint, save_checkpoint
+from splat.training.checkpoint import open_subject, save_checkpoint
 from splat.training.loop import train
+from splat.training.origin.subject import Checkpoint
 from splat.training.score.evaluate import evaluate
 from splat.training.state import ThreeDGS, Training
 
@@ -67,8 +67,9 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
     require_replaceable(out, RECORD)
     stages = Stages(console)
     with stages.stage("load"):
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
-        objective, l2 = (scene_objective(checkpoint, scene, loss=loss) for loss in (None, L2))
+        subject = open_subject(options.checkpoint, options.foreign, out)
+        checkpoint, scene = subject.checkpoint, subject.scene
+        objective, l2 = (subject.objective(loss=loss) for loss in (None, L2))
         held_out = scene.load(checkpoint.scene.test) if checkpoint.scene.test else []
     amounts = {name: getattr(options, name) for name in ("curve", "curve_steps", "sample", *CHOICE)}
     tested = {name: checkpoint.scene.views[name] for name in checkpoint.scene.test}
@@ -88,7 +89,7 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
             refine(training, objective.views, options.refine, options.seed)
             scene_from_there = replace(checkpoint.scene, relative=os.path.relpath(scene.root, out.resolve()))
             _write_pruned(folder, replace(checkpoint, training=training, scene=scene_from_there))
-        origin = provenance_of(made, options.checkpoint, command, checkpoint, scene)
+        origin = provenance_of(made, subject, command)
         (folder / RECORD).write_text(json_text(plain(origin)), encoding="utf-8")
         notes = draw_or_say("uses", folder) if curve is not None else []
         result = _scored(training.gaussians, objective, held_out)

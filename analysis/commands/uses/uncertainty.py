@@ -24,9 +24,8 @@ from analysis.commands.uses.options import UncertaintyOptions
 from analysis.console.drawing import draw_or_say
 from analysis.console.plain import say
 from analysis.console.stages import Stages
-from analysis.probe.command import opened
-from analysis.probe.record import provenance_of
 from analysis.records.json_files import json_text, plain
+from analysis.records.provenance import provenance_of
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError
 from splat.curvature.linearize import LinearizedView
@@ -35,6 +34,7 @@ from splat.curvature.scores.uncertainty import pixel_variance
 from splat.losses.reference import LossSettings
 from splat.render.backend import CPU
 from splat.scenes.view import View
+from splat.training.checkpoint import open_subject
 
 RECORD = "uncertainty.json"  # the file by which a folder of results is known
 
@@ -51,7 +51,8 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
     require_replaceable(out, RECORD)
     stages, generator, rows = Stages(Console(stderr=True)), torch.Generator().manual_seed(options.seed), []
     with stages.stage("load"):
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
+        subject = open_subject(options.checkpoint, options.foreign, out)
+        checkpoint, scene = subject.checkpoint, subject.scene
         if not checkpoint.scene.test:
             raise InputError("expected a scene with held-out views, whose errors are the truth, got none")
         held_out, training = scene.load(checkpoint.scene.test), checkpoint.training
@@ -76,7 +77,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         table.to_csv(folder / "agreement.csv", index=False)
         tested = {name: checkpoint.scene.views[name] for name in checkpoint.scene.test}
         of = checkpoint.fingerprint({"samples": options.samples}, options.seed, L2, tested)
-        made = provenance_of(of, options.checkpoint, command, checkpoint, scene)
+        made = provenance_of(of, subject, command)
         (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     means = table.drop(columns="view").pivot_table(index="precision")  # by default means

@@ -9,20 +9,20 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from analysis.commands.map.command import ENDS, PROBE, measured_fields, require_known_field
+from analysis.commands.map.fields import ENDS, PROBE, measured_fields, require_known_field
 from analysis.commands.options import ViewOptions
 from analysis.commands.view.page import offline_page
 from analysis.commands.view.viewer import APPEARANCE, Viewer
 from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.measures.steepest import heaviest_view
-from analysis.probe.command import opened, scene_objective
-from analysis.slice.directions import RISE, UNITS, recorded_probe
+from analysis.measures.units import RISE, UNITS
+from analysis.records.records import recorded_probe
 from landscape import curvature_reach
 from landscape.errors import InputError
 from splat.curvature.fields import FIELDS
 from splat.curvature.objective import SceneObjective
-from splat.training.checkpoint import write_atomically
+from splat.training.checkpoint import open_subject, write_atomically
 from splat.training.origin.fingerprint import Fingerprint
 
 STEEPEST = "e₁"
@@ -35,9 +35,8 @@ def run_view(options: ViewOptions) -> int:
     console, folder = Console(stderr=True), options.checkpoint.parent
     stages = Stages(console)
     with stages.stage("load"):
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, folder / "view")
-        objective = scene_objective(checkpoint, scene)
-        made = checkpoint.fingerprint({}, 0)
+        subject = open_subject(options.checkpoint, options.foreign, folder / "view")
+        objective, made = subject.objective(), subject.checkpoint.fingerprint({}, 0)
         directions = steepest_directions(objective, folder / PROBE, made)
         start = heaviest_view(objective, directions[STEEPEST][0]) if STEEPEST in directions else 0
     server = _server(viser, options)

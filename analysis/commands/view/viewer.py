@@ -19,11 +19,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from analysis.commands.map.command import Fields, in_words
+from analysis.commands.map.fields import Fields, in_words
 from analysis.commands.map.pictures import rendered
 from analysis.measures.steepest import in_bytes
+from analysis.measures.units import UNITS
 from analysis.records.quantities import Shade, percent, quantity
-from analysis.slice.directions import UNITS
 from landscape.errors import InputError
 from splat.curvature.fields import Field
 from splat.curvature.objective import SceneObjective

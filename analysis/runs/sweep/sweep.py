@@ -43,7 +43,7 @@ from analysis.train.command import planned, resumed
 from analysis.train.training_time import TrainingTime
 from landscape.errors import InputError
 from splat.model.untrusted import Taken, locked
-from splat.training.checkpoint import Checkpoint
+from splat.training.origin.subject import Checkpoint
 
 Stage = Literal["train", "probe"]
 CELL_FAILED = 1

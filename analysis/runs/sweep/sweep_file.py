@@ -28,7 +28,6 @@ from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from analysis.console.options import TrainerOptions
 from analysis.console.overrides import leaves, read_value
 from analysis.probe.options import ProbeOptions
 from analysis.train.options import TrainOptions
@@ -36,10 +35,11 @@ from landscape.errors import InputError
 from splat.model.untrusted import read_toml, require_name
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
+from splat.training.origin.options import Trainer
 
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
-OF_THE_CELL = {"checkpoint", "out", "scene", "foreign"}  # options of probe that the cell decides
-TRAINER = get_type_hints(TrainerOptions)
+OF_THE_CELL = {"checkpoint", "out", "foreign"}  # options of probe that the cell decides
+TRAINER = get_type_hints(Trainer)
 TRAINING = {
     name.strip("_"): hint
     for name, hint in (get_type_hints(TrainOptions) | TRAINER).items()
@@ -133,7 +133,7 @@ def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -
 def _options(options: Mapping[str, Any], seed: int, out: Path) -> TrainOptions:
     """Options of a cell; {seed} in the checkpoint that it starts from is its seed."""
     start = options.get("from")
-    foreign = TrainerOptions(**{name: value for name, value in options.items() if name in TRAINER})
+    foreign = Trainer(**{name: value for name, value in options.items() if name in TRAINER})
     rest = {name: value for name, value in options.items() if name not in {"from", *TRAINER}}
     source = start and Path(str(start).replace("{seed}", str(seed)))
     return TrainOptions(**rest, foreign=foreign, seed=seed, out=out, from_=source)

@@ -80,10 +80,9 @@ def projector_of(objective: SceneObjective, *, gauss_newton: bool = False, singl
     if gauss_newton:
         n, bands = active.sh.shape[:2]
         views = [view.jacobian for view in objective.linearized]
-        return Projector(objective.blocks, seen_parameters(views, n, bands, objective.gather_rows))
+        return Projector(objective.blocks, seen_parameters(views, n, bands))
     views = (view.jacobian for view in objective.linearized)
-    gather = objective.gather_rows, objective.mean_over_views
-    colours = seen_colours(views, len(objective.views), active, *gather, slopes=not single)
+    colours = seen_colours(views, len(objective.views), active, slopes=not single)
     return Projector(objective.blocks, colours, active.quats)
 
 

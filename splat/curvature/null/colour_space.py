@@ -14,17 +14,7 @@ from torch import Tensor
 
 from splat.backend.cpu.threads import over_range
 from splat.curvature.null.colour_space_cpu import project_colours
-from splat.curvature.null.row_space import (
-    CHUNK,
-    TOLERANCE,
-    Gather,
-    RowSpace,
-    identity,
-    joined,
-    orthonormal,
-    row_space,
-    spanned,
-)
+from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, joined, orthonormal, row_space, spanned
 from splat.model.gaussians import Gaussians
 from splat.projection.formulas import ProjectionJacobian
 from splat.render.backend import CPU, backend_of
@@ -88,18 +78,11 @@ class ColourSpace:
 
 
 def seen_colours(
-    views: Iterable[ProjectionJacobian],
-    count: int,
-    gaussians: Gaussians,
-    gather_rows: Gather = identity,
-    gather_sums: Gather = identity,
-    *,
-    slopes: bool = True,
+    views: Iterable[ProjectionJacobian], count: int, gaussians: Gaussians, *, slopes: bool = True
 ) -> ColourSpace:
     """The directions of each Gaussian's SH coefficients in which the Hessian can be non-zero.
 
-    count: number of views.  gather_rows, gather_sums: map rows of these views, and sums over them, to those of the views of all
-    processes (sums up to a factor).  slopes: False for the Hessian's block of SH alone, which has none.
+    count: number of views.  slopes: False for the Hessian's block of SH alone, which has none.
     """
     like, (n, bands) = gaussians.flat, gaussians.sh.shape[:2]
     rows = like.new_zeros(n, count, bands + 3)  # harmonics, and which channels are not clamped
@@ -111,7 +94,7 @@ def seen_colours(
         terms = torch.einsum("ekj,ec->ejkc", slope[:, :bands], bar).flatten(2)
         sums.index_add_(0, index, terms)
         sizes.index_add_(0, index, terms.flatten(1).norm(dim=1))
-    rows, sums, sizes = gather_rows(rows), gather_sums(sums)[:, : 3 if slopes else 0], gather_sums(sizes)
+    sums, sizes = sums[:, : 3 if slopes else 0] / count, sizes / count
     chunks, tolerance = zip(*(x.split(CHUNK) for x in (rows, sums, sizes)), strict=True), TOLERANCE[like.dtype]
     return _joined([_colours_of(r.double(), s.double(), a.double(), tolerance).to(like.dtype) for r, s, a in chunks])
 

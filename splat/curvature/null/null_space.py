@@ -25,18 +25,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.curvature.null.row_space import CHUNK, TOLERANCE, Gather, RowSpace, identity, joined, row_space
+from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, joined, row_space
 from splat.projection.formulas import GEOMETRY, ProjectionJacobian
 
 
-def seen_parameters(views: Sequence[ProjectionJacobian], n: int, bands: int, gather: Gather = identity) -> RowSpace:
-    """The directions of each of n Gaussians' parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees.
-
-    gather: maps rows of these views to those of the views of all processes.
-    """
+def seen_parameters(views: Sequence[ProjectionJacobian], n: int, bands: int) -> RowSpace:
+    """The directions of each of n Gaussians' parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
     dtype = _like(views).dtype
     parts = [
-        row_space(gather(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), TOLERANCE[dtype]).to(dtype)
+        row_space(_jacobian_rows(views, start, min(start + CHUNK, n), bands), TOLERANCE[dtype]).to(dtype)
         for start in range(0, n, CHUNK)
     ]
     return joined(parts)

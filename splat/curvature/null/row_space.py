@@ -4,7 +4,7 @@ A basis is found by a singular value decomposition of the rows; directions with 
 largest are null.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,15 +58,6 @@ def orthonormal(rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSpa
     over_batch(len(rows), decompose, matrices.device)
     kept = torch.arange(rows.shape[1], device=rows.device) < rank[:, None]
     return RowSpace(torch.where(kept[:, :, None], directions.to(rows), 0.0), rank)
-
-
-Gather = Callable[[Tensor], Tensor]
-"""Rows of this process's views -> rows of all views."""
-
-
-def identity(rows: Tensor) -> Tensor:
-    """`Gather` of a process that has all views."""
-    return rows
 
 
 def joined(parts: Sequence[RowSpace]) -> RowSpace:

@@ -90,7 +90,7 @@ def block_shares(
 def _share(operator: ViewSum, blocks: PerGaussianBlocks, Z: Float[Tensor, "p s"]) -> BlockShare:
     """operator: H; blocks: of P H P."""
     objective = operator.objective
-    product = _across(objective.active, objective.mean_over_views(operator.apply(_across(objective.active, Z))))
+    product = _across(objective.active, operator.apply(_across(objective.active, Z)) / len(objective.views))
     rest = (product - blocks.apply(Z, objective.active)).double().square().sum(dim=0)
     geometry, sh = blocks.geometry.double().square(), float(blocks.sh.double().square().sum())
     diagonal = float(geometry.diagonal(dim1=1, dim2=2).sum()) + sh

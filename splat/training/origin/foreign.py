@@ -25,10 +25,11 @@ from splat.model.settings import RenderSettings
 from splat.model.untrusted import loose_json
 from splat.render.render import render
 from splat.scenes.scene import Scene, load_scene
-from splat.scenes.splits import Split, explicit_split, split_scene
+from splat.scenes.splits import Split, explicit_split, read_names, split_scene
 from splat.scenes.view import View
 from splat.scenes.write import bytes_of, png
 from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_frame, posed, shift_of, shift_to_origin
+from splat.training.origin.options import Foreign
 from splat.training.origin.presets import PRESETS, Preset, preset_of, render_of
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig, Training
@@ -46,41 +47,23 @@ REGULARIZERS = ("opacity_reg", "scale_reg")
 MCMC_DEFAULT = 0.01  # of both in 3DGS-MCMC, whose cfg_args does not have them
 
 
-@dataclass(frozen=True)
-class Foreign:
-    """Facts that a file of another tool lacks.
-
-    scene: folder.  views: how many, by the scene's protocol; train_list: names of the training views.  trained_by: a name of
-    `PRESETS`.  images, downscale: as for `load_scene`.  antialiased: whether its renderer was, where the file does not know.
-    opacity_reg, scale_reg: the loss's weights of these names (`LossSettings`); trained: those of the tool's settings.
-    """
-
-    scene: Path | None = None
-    views: int | Literal["all"] | None = None
-    train_list: tuple[str, ...] | None = None
-    trained_by: str | None = None
-    images: str | None = None
-    downscale: float | None = None
-    antialiased: bool | None = None
-    opacity_reg: float | Literal["trained"] | None = None
-    scale_reg: float | Literal["trained"] | None = None
-
-
-def foreign_training(path: Path, ask: Foreign, picture: Path) -> tuple[Training, SceneReference, dict[str, Any]]:
+def foreign_training(
+    path: Path, ask: Foreign, picture: Path, train: Sequence[str] | None = None
+) -> tuple[Training, SceneReference, dict[str, Any]]:
     """The training, its scene as seen from path, and what was assumed, for the record.
 
-    picture: where render and photograph are written side by side when they do not agree.  InputError then, and for what is
-    missing or cannot be.
+    train: names of the training views, where known.  picture: where render and photograph are written side by side when
+    they do not agree.  InputError then, and for what is missing or cannot be.
     """
     if ask.scene is None:
         raise InputError(f"expected --scene FOLDER for {path}: a file of another tool does not name its scene")
     found = read_splats(path)
     name, source = preset_of(found.tool, ask.trained_by)
     preset = PRESETS[name]
-    antialiased = found.antialiased if ask.antialiased is None else ask.antialiased
+    antialiased = found.antialiased or ask.antialiased
     render = render_of(preset, found.settings, antialiased=antialiased)
     scene, images, downscale = _scene(found, ask, preset)
-    split, how = _split(scene, found, ask, path)
+    split, how = _split(scene, found, ask, path, train)
     reference = SceneReference.to(scene, path, split, images, downscale)
     config = _config(scene, found, preset.loss, render, ask)
     poses = [
@@ -131,12 +114,14 @@ def _scene(found: SplatFile, ask: Foreign, preset: Preset) -> tuple[Scene, str |
     return scene, images, downscale
 
 
-def _split(scene: Scene, found: SplatFile, ask: Foreign, path: Path) -> tuple[Split, str]:
+def _split(scene: Scene, found: SplatFile, ask: Foreign, path: Path, train: Sequence[str] | None) -> tuple[Split, str]:
     """The training views, and where they are known from."""
+    if ask.train_list is not None and ask.views is not None:
+        raise InputError("expected --views or --train-list, got both; leave one out")
     if ask.train_list is not None:
-        if ask.views is not None:
-            raise InputError("expected --views or --train-list, got both; leave one out")
-        return explicit_split(scene.names, ask.train_list), "as listed"
+        train = read_names(ask.train_list)
+    if train is not None:
+        return explicit_split(scene.names, train), "as listed"
     if ask.views is not None:
         return split_scene(scene, None if ask.views == "all" else ask.views), f"asked for: {ask.views}"
     held_out = split_scene(scene)

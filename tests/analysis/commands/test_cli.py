@@ -97,7 +97,7 @@ def test_a_run_leaves_a_checkpoint_renders_and_metrics_that_agree(finished, orig
     assert loaded.scene.find(finished / "checkpoint.pt") == original.resolve()
     metrics = json.loads((finished / "metrics.json").read_text())
     assert (metrics["step"], metrics["gaussians"]) == (ITERATIONS, len(loaded.training.gaussians))
-    views = loaded.load_scene(finished / "checkpoint.pt").load(loaded.scene.test)
+    views = loaded.with_scene(finished / "checkpoint.pt").scene.load(loaded.scene.test)
     assert set(metrics["test"]["views"]) == {view.name for view in views} and len(metrics["train"]["views"]) == 3
     for view in views:
         with torch.no_grad():
@@ -298,8 +298,8 @@ def test_a_checkpoint_whose_scene_has_moved_says_so_and_takes_its_folder(scene, 
     loaded = load_checkpoint(path)
     moved = scene.rename(tmp_path / "moved")
     with pytest.raises(FileNotFoundError, match="--scene"):
-        loaded.load_scene(path)
-    assert loaded.load_scene(path, moved).names == loaded.load_scene(path, moved).names
+        loaded.with_scene(path)
+    assert loaded.with_scene(path, moved).scene.names == loaded.with_scene(path, moved).scene.names
     transforms = json.loads((moved / "transforms.json").read_text())
     for frame in transforms["frames"]:
         frame.update(w=12, h=9, fl_x=frame["fl_x"] / 2, fl_y=frame["fl_y"] / 2, cx=6, cy=4.5)
@@ -307,7 +307,7 @@ def test_a_checkpoint_whose_scene_has_moved_says_so_and_takes_its_folder(scene, 
     (moved / "transforms.json").write_text(json.dumps(transforms))
     smaller = r"changes in 4 of 4: 'images/view_\d+.png': 12 x 9 px instead of 24 x 18 px"
     with pytest.raises(ValueError, match=smaller):
-        loaded.load_scene(path, moved)
+        loaded.with_scene(path, moved)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from analysis.commands.cli import main
-from analysis.commands.map.command import measured_fields
+from analysis.commands.map.fields import measured_fields
 from analysis.commands.map.pictures import rendered
 from analysis.commands.view import command, page
 from analysis.commands.view import viewer as view

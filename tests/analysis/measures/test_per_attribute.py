@@ -24,7 +24,6 @@ from analysis.measures.per_attribute import (
     quotient,
 )
 from analysis.measures.split_control import split_in_two
-from analysis.probe.command import scene_objective
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.report import render_report
 from analysis.records.schema import INDICES, End, Index
@@ -44,8 +43,9 @@ from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.adam import Adam
-from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import ScreenGradients
+from splat.training.origin.subject import Checkpoint
 from tests.recorded import soft
 
 SCENE = SyntheticSettings(gaussians=50, views=4, width=16, height=12)
@@ -76,7 +76,7 @@ def checkpoint(path: Path) -> Checkpoint:
 
 @pytest.fixture(scope="module")
 def objective(path: Path, checkpoint: Checkpoint) -> SceneObjective:
-    return scene_objective(checkpoint, checkpoint.load_scene(path))
+    return checkpoint.with_scene(path).objective()
 
 
 def silent(name: str) -> nullcontext:

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from analysis.commands.cli import main
-from analysis.probe.command import scene_objective
 from analysis.records.records import Record
 from splat.losses.reference import photometric_loss
 from splat.render.render import render
@@ -52,7 +51,7 @@ def dense(run):
     """(objective, P H P, L, gradient): double backward through the reference renderer, on the quaternions' tangent spaces."""
     path = run / "double.pt"
     loaded = load_checkpoint(path)
-    objective = scene_objective(loaded, loaded.load_scene(path))
+    objective = loaded.with_scene(path).objective()
     active, settings = objective.active, loaded.training.config.loss
 
     def loss(flat):

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from analysis.commands.cli import main
-from analysis.probe.command import asked, opened
-from analysis.probe.record import provenance_of
+from analysis.probe.command import asked
 from analysis.records.json_files import plain
+from analysis.records.provenance import provenance_of
 from analysis.records.quantities import measured, quantity
 from analysis.records.schema import Index
 from analysis.records.tables import bracketed
@@ -24,7 +24,7 @@ from splat.losses.reference import LossSettings
 from splat.model.files.splat_ply import splat_ply
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.checkpoint import load_checkpoint, open_subject, save_checkpoint
 from splat.training.methods.sam import SAM
 from splat.training.origin.fingerprint import FORMULAS
 from tests.figures.test_trajectory_figure import rows
@@ -363,9 +363,9 @@ def test_files_of_other_tools_are_compared_as_they_were_probed(trained, tmp_path
 
     def probe(options, command) -> int:
         commanded.append(" ".join(command))
-        checkpoint, loaded = opened(options.checkpoint, options.scene, options.foreign, options.out)
+        subject = open_subject(options.checkpoint, options.foreign)
         data, arrays = synthetic()
-        made = provenance_of(asked(options, checkpoint), options.checkpoint, command, checkpoint, loaded)
+        made = provenance_of(asked(options, subject.checkpoint), subject, command)
         data["provenance"] = plain(made)
         written(options.out, data, arrays)
         return 0

@@ -15,7 +15,6 @@ import torch
 from msgspec import convert
 
 from analysis.commands.cli import main
-from analysis.probe.command import scene_objective
 from analysis.records.json_files import plain
 from analysis.records.records import Record, read_record
 from analysis.records.schema import FiniteProbe
@@ -27,7 +26,7 @@ from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.adam import Adam
-from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.checkpoint import load_checkpoint, open_subject, save_checkpoint
 from splat.training.densify import ScreenGradients
 from splat.training.origin.fingerprint import Fingerprint
 from tests.recorded import soft, synthetic, synthetic_line, written
@@ -84,8 +83,7 @@ def objective(run) -> SceneObjective:
 
 
 def objective_of(path: Path) -> SceneObjective:
-    checkpoint = load_checkpoint(path)
-    return scene_objective(checkpoint, checkpoint.load_scene(path))
+    return open_subject(path).objective()
 
 
 def sliced(out: Path, checkpoint: Path, *options: str) -> Record:

@@ -43,7 +43,7 @@ def test_a_row_is_the_first_training_view_as_the_checkpoint_renders_it(run):
     for _, row in table.iloc[1:].iterrows():
         path = run / f"step-{row['step']:.0f}" / "checkpoint.pt"
         loaded = load_checkpoint(path)
-        training, (view,) = loaded.training, loaded.load_scene(path).load(loaded.scene.train[:1])
+        training, (view,) = loaded.training, loaded.with_scene(path).scene.load(loaded.scene.train[:1])
         with torch.no_grad():
             image = render(training.gaussians, view.camera, torch.zeros(3), training.config.render).image
         assert row["psnr"] == pytest.approx(psnr(image, view.image), rel=1e-6)

@@ -34,12 +34,13 @@ from splat.losses.reference import LossSettings
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings
 from splat.training.methods.corgs import CoRGS
 from splat.training.methods.second_order.gn_cg import GaussNewtonCG
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.origin.frames import posed, shift_in_words, shift_of
+from splat.training.origin.subject import Checkpoint
 from splat.training.start import Source
 from splat.training.state import TrainConfig, Training
 from tests.splat.tiny import tiny_gaussians, tiny_views
@@ -148,7 +149,7 @@ def test_a_world_far_from_its_origin_is_planned_near_it_and_loaded_again_as_it_w
     assert shift is not None and "the world is moved by -(431000" in scene.notes[-1]
     rounding = np.spacing(5412000.0)
     training = Training.start(tiny_gaussians(), 1.0, config)
-    loaded = Checkpoint(training, reference).load_scene(tmp_path / "run/checkpoint.pt")
+    loaded = Checkpoint(training, reference).with_scene(tmp_path / "run/checkpoint.pt").scene
     for plain, far, again in zip(made.frames, scene.frames, loaded.frames, strict=True):
         moved = plain.camera.centre.numpy() + np.array(away) - np.array(shift)
         assert np.abs(far.camera.centre.numpy() - moved).max() <= rounding
@@ -306,10 +307,10 @@ def test_a_run_with_masks_of_a_folder_is_probed_and_resumed_with_these(original,
     assert train(original, out, *masks) == train(original, out, *masks, "--resume") == 0
     assert train(original, out, "--resume") == 2 and "masks = " in capsys.readouterr().err
     loaded = load_checkpoint(out / "checkpoint.pt")
-    assert loaded.load_scene(out / "checkpoint.pt").load(loaded.scene.test)[0].mask is not None
+    assert loaded.with_scene(out / "checkpoint.pt").scene.load(loaded.scene.test)[0].mask is not None
     (tmp_path / "masks" / Path(loaded.scene.test[0]).name).unlink()
     with pytest.raises(InputError, match="no mask where there was one"):
-        loaded.load_scene(out / "checkpoint.pt")
+        loaded.with_scene(out / "checkpoint.pt")
 
 
 def test_a_method_in_place_of_adam_says_what_it_leaves_out():

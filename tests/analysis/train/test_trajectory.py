@@ -56,7 +56,7 @@ def at_the_end(run) -> tuple:
     """(training, views, objective, reference) of the finished run."""
     path = run / "checkpoint.pt"
     loaded = load_checkpoint(path)
-    views = loaded.load_scene(path).load(loaded.scene.train)
+    views = loaded.with_scene(path).scene.load(loaded.scene.train)
     config = loaded.training.config
     objective = SceneObjective(loaded.training.gaussians, views, config.loss, torch.zeros(3), config.render)
     return loaded.training, views, objective, loaded.scene
@@ -132,7 +132,7 @@ def test_the_start_is_kept_and_finds_its_scene(run):
     path = run / "start" / "checkpoint.pt"
     loaded = load_checkpoint(path)
     assert loaded.training.step == 0
-    assert (path.parent / loaded.scene.relative).resolve() == loaded.load_scene(path).root.resolve()
+    assert (path.parent / loaded.scene.relative).resolve() == loaded.with_scene(path).scene.root.resolve()
 
 
 def test_a_run_killed_beside_a_checkpoint_and_resumed_gives_the_same_rows(scene, run, monkeypatch):

@@ -52,11 +52,7 @@ def work(ranks):
         "seeds": complaint(lambda: spectral_density(H, generator(ranks.rank))),
         "counts": complaint(lambda: H.apply(torch.zeros(N, 1 + ranks.rank, dtype=H.dtype))),
         "few": complaint(lambda: ranks.share([0])),
-        "any": ranks.any(torch.tensor([False, ranks.rank == 1, True])),
-        "gathered": torch.cat(ranks.gather(torch.tensor([ranks.rank]))),
-        "lost": []
-        if ranks.rank
-        else [told_of_a_loss(ranks.sum), told_of_a_loss(ranks.gather)],  # the second rank leaves
+        "lost": "" if ranks.rank else told_of_a_loss(ranks.sum),  # the second rank leaves
     }
 
 
@@ -99,13 +95,7 @@ def test_ranks_that_disagree_all_say_so(found):
 
 
 def test_a_process_that_leaves_is_not_waited_for(found):
-    said = found[0]["lost"]
-    assert len(said) == 2 and all("expected all processes to exchange numbers, lost one" in told for told in said)
-
-
-def test_masks_and_tensors_meet_in_the_order_of_ranks(found):
-    for rank in found:
-        assert rank["any"].tolist() == [False, True, True] and rank["gathered"].tolist() == [0, 1]
+    assert "expected all processes to exchange numbers, lost one" in found[0]["lost"]
 
 
 def test_without_a_group_the_error_says_how_to_make_one():

@@ -179,7 +179,7 @@ def test_a_sum_over_some_views_takes_the_first_of_them():
     scene = objective(random_gaussians(20, 1, logit=1.0))
     first, second = scene.linearized
     V = random_like((scene.active.flat.numel(), 2), 3)
-    assert torch.equal(ViewSum(scene, count=1).apply(V), first.hvp(V))
+    assert torch.equal(ViewSum(scene, indices=[0]).apply(V), first.hvp(V))
     assert torch.equal(ViewSum(scene, gauss_newton=True).apply(V), first.ggn(V) + second.ggn(V))
 
 

@@ -21,7 +21,9 @@ def objective(views: Iterable[int] = range(VIEWS)) -> SceneObjective:
     return SceneObjective(gaussians, [loaded[i] for i in views])
 
 
-@pytest.mark.parametrize("options", [{}, {"gauss_newton": True}, {"ssim_window": False}, {"count": 2}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"gauss_newton": True}, {"ssim_window": False}, {"indices": range(2)}], ids=str
+)
 def test_the_curvature_along_a_vector_is_the_mean_of_those_in_single_views(options):
     whole, generator = objective(), torch.Generator().manual_seed(1)
     V = torch.linalg.qr(torch.randn(len(whole.active.flat), 2, generator=generator))[0]

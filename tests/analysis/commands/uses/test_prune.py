@@ -52,14 +52,14 @@ def test_the_highest_scores_are_kept_in_both_files(curved, folder):
     assert torch.equal(written.gaussians.flat, expected.flat) and written.tool == "splat-landscape"
     loaded = load_checkpoint(curved / "checkpoint.pt")
     assert torch.equal(loaded.training.gaussians.flat, expected.flat)
-    assert loaded.load_scene(curved / "checkpoint.pt").root == (folder / "scene").resolve()
+    assert loaded.with_scene(curved / "checkpoint.pt").scene.root == (folder / "scene").resolve()
 
 
 def test_the_curve_scores_what_is_left(curved):
     curve, loaded = pd.read_csv(curved / "curve.csv"), load_checkpoint(curved / "checkpoint.pt")
     assert {*curve.score} == {*SCORES} and len(curve) == len(SCORES) * (len(prune.REMOVED) + len(prune.REFINED))
     path, views = curved / "checkpoint.pt", loaded.scene
-    kept = evaluate(loaded.training.gaussians, loaded.load_scene(path).load(views.test))
+    kept = evaluate(loaded.training.gaussians, loaded.with_scene(path).scene.load(views.test))
     row = curve[(curve.score == "opacity") & (curve.removed == 0.6) & (curve.steps == 0)].iloc[0]
     assert row.test_psnr == pytest.approx(kept.psnr, abs=1e-4) and row.test_ssim == pytest.approx(kept.ssim, abs=1e-6)
     assert curve[curve.removed == 0].train_psnr.nunique() == 1
@@ -79,7 +79,7 @@ def test_refinement_lowers_the_training_loss(folder, tmp_path):
         out = tmp_path / str(steps)
         assert run(folder, "--sample", "3", "--keep", "0.3", "--refine", str(steps), "--out", str(out)) == 0
         loaded = load_checkpoint(out / "checkpoint.pt")
-        views = loaded.load_scene(out / "checkpoint.pt").load(loaded.scene.train)
+        views = loaded.with_scene(out / "checkpoint.pt").scene.load(loaded.scene.train)
         psnr[steps] = evaluate(loaded.training.gaussians, views).psnr
     assert psnr[20] > psnr[0] + 0.1
 

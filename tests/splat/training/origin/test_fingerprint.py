@@ -7,8 +7,9 @@ import torch
 
 from splat.losses.reference import LossSettings
 from splat.model.settings import RenderSettings
-from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.origin.fingerprint import FORMULAS, SAME, ViewData, changes, in_short, state_of
+from splat.training.origin.subject import Checkpoint
 from splat.training.state import Training
 from tests.splat.tiny import EXTENT, LENS, LEVEL, REFERENCE, SEEN, SIZE, tiny_config, tiny_gaussians
 

@@ -4,7 +4,7 @@ trainer; where it is not the picture of its scene, nothing is measured.
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -16,18 +16,19 @@ from PIL import Image
 
 from landscape.errors import InputError
 from splat.curvature.hessian import SceneHessian
-from splat.curvature.objective import SceneObjective
 from splat.model.files.splat_ply import splat_ply
 from splat.model.gaussians import Gaussians
 from splat.scenes.scene import load_scene
 from splat.scenes.splits import split_scene, spread_views
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from splat.training.checkpoint import Checkpoint, open_checkpoint, save_checkpoint
+from splat.training.checkpoint import load_checkpoint, open_checkpoint, open_subject, save_checkpoint
 from splat.training.loop import train
-from splat.training.origin.foreign import LEAST_PSNR, MARGIN, Foreign
+from splat.training.origin.foreign import LEAST_PSNR, MARGIN
+from splat.training.origin.options import Foreign
 from splat.training.origin.presets import PRESETS
 from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import Checkpoint
 from splat.training.state import TrainConfig, Training
 from tests.refusals import refused
 from tests.splat.model.files import written
@@ -49,9 +50,8 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
-def opened(path: Path, **ask) -> Checkpoint:
-    ask = {"scene": path.parents[0] / "scene", **ask}
-    return open_checkpoint(path, Foreign(**ask), path.with_name("mismatch.png"))
+def opened(path: Path, train: Sequence[str] | None = None, **ask) -> Checkpoint:
+    return open_checkpoint(path, Foreign(**{"scene": path.parents[0] / "scene", **ask}), path, train)
 
 
 def stored(path: Path, content: bytes) -> Path:
@@ -68,11 +68,6 @@ def own(path: Path, scene: Path) -> Path:
     return path
 
 
-def objective(checkpoint: Checkpoint, path: Path) -> SceneObjective:
-    scene, training = checkpoint.load_scene(path), checkpoint.training
-    return training.config.objective(training.gaussians, scene.load(checkpoint.scene.train))
-
-
 WRITTEN: dict[str, Callable[[Gaussians], bytes]] = {
     "graphdeco.ply": lambda g: written.ply(written.columns(g)),
     "gsplat.ply": lambda g: written.ply(written.columns(g, normals=False)),
@@ -86,9 +81,9 @@ WRITTEN: dict[str, Callable[[Gaussians], bytes]] = {
 @pytest.mark.parametrize("name", WRITTEN)
 def test_loss_gradient_and_products_are_those_of_our_own_checkpoint(folder, name):
     path = stored(folder / name, WRITTEN[name](gaussians()))
-    ours = objective(open_checkpoint(own(folder / "own.pt", folder / "scene"), Foreign(), path), folder / "own.pt")
-    names = open_checkpoint(folder / "own.pt", Foreign(), path).scene.train
-    theirs = objective(opened(path, trained_by=OURS, train_list=tuple(names)), path)
+    subject = open_subject(own(folder / "own.pt", folder / "scene"))
+    ours = subject.objective()
+    theirs = opened(path, subject.checkpoint.scene.train, trained_by=OURS).with_scene(path).objective()
     assert torch.equal(theirs.active.flat, ours.active.flat)
     flat = ours.active.flat
     assert theirs.loss(flat) == pytest.approx(ours.loss(flat), rel=1e-5)
@@ -103,8 +98,9 @@ def test_a_training_continues_from_it(folder):
     found = opened(path, trained_by=OURS)
     config = replace(found.training.config, iterations=3)
     training = Training.start(found.training.gaussians, found.training.extent, config)
-    views = found.load_scene(path).load(found.scene.train)
-    before = objective(found, path).loss(objective(found, path).active.flat)
+    views = found.with_scene(path).scene.load(found.scene.train)
+    own_loss = found.with_scene(path).objective()
+    before = own_loss.loss(own_loss.active.flat)
     assert [done.step for done in train(training, views)] == [1, 2, 3]
     assert not torch.equal(training.gaussians.flat, found.training.gaussians.flat) and before > 0
 
@@ -113,10 +109,10 @@ def test_what_is_not_the_scenes_picture_is_not_measured_and_shown(folder):
     g = gaussians()
     g.means.mul_(-1)
     path = stored(folder / "a.ply", written.ply(written.columns(g)))
-    with pytest.raises(InputError, match=r"got \d+\.\d dB on training views .*mismatch\.png") as caught:
+    with pytest.raises(InputError, match=r"got \d+\.\d dB on training views .*a.ply-mismatch") as caught:
         opened(path, trained_by=OURS)
     assert "\n" not in str(caught.value)
-    assert path.with_name("mismatch.png").read_bytes().startswith(b"\x89PNG")
+    assert path.with_name("a.ply-mismatch.png").read_bytes().startswith(b"\x89PNG")
 
 
 def faded(folder: Path, contrast: float) -> Path:
@@ -175,8 +171,8 @@ def test_an_spz_is_read_in_the_axes_in_which_it_looks_like_the_scene(folder):
         (("trained by someone",), {}, "which says 'someone'"),
         ((), {"trained_by": "nobody"}, "got nobody"),
         ((), {"trained_by": OURS, "scene": None}, "expected --scene FOLDER"),
-        ((), {"trained_by": OURS, "views": 2, "train_list": ("view_001",)}, "--views or --train-list"),
-        ((), {"trained_by": OURS, "train_list": ("nothing",)}, "name of one view"),
+        ((), {"trained_by": OURS, "views": 2, "train_list": Path("views.txt")}, "--views or --train-list"),
+        ((), {"trained_by": OURS, "train": ("nothing",)}, "name of one view"),
         ((), {"trained_by": "nerfstudio"}, "dataparser_transforms.json"),
     ],
 )
@@ -211,8 +207,8 @@ def test_mip_splattings_ply_is_the_same_as_our_own_checkpoint_with_its_filter(fo
     render = theirs.training.config.render
     assert (render.antialias, render.blur) == ("mip-splatting", 0.1)
     save_checkpoint(folder / "own.pt", theirs.training, theirs.scene)
-    ours = open_checkpoint(folder / "own.pt", Foreign(), path)
-    both = [objective(each, path) for each in (theirs, ours)]
+    ours = load_checkpoint(folder / "own.pt")
+    both = [each.with_scene(path).objective() for each in (theirs, ours)]
     assert both[0].active.filter_widths is not None
     assert torch.equal(both[0].gradient, both[1].gradient)
     plain = theirs.training.config.objective(g.with_filter(None), both[0].views)
@@ -234,7 +230,7 @@ def names(*numbers: int) -> list[str]:
     [
         (None, None, {}, names(*range(1, 8), 9, 10, 11), "guessed"),
         (None, None, {"views": 2}, names(1, 11), "asked for"),
-        (None, None, {"train_list": ("view_003", "view_000.png")}, names(3, 0), "as listed"),
+        (None, None, {"train": ("view_003", "view_000.png")}, names(3, 0), "as listed"),
         ("Namespace(eval=True)", None, {}, names(*range(1, 8), 9, 10, 11), "cfg_args"),
         ("Namespace(eval=False)", None, {}, names(*range(12)), "cfg_args"),
         ("Namespace(eval=True)", ["view_000", "view_002", "view_005.JPG"], {}, names(2, 5), "cameras.json"),
@@ -316,10 +312,10 @@ def test_3dgs_looks_through_the_middle_of_images_of_1600_px_at_most(folder, monk
     file.write_text(json.dumps(content))
     path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
     found = opened(path, trained_by="graphdeco")
-    scene = found.load_scene(path)
+    scene = found.with_scene(path).scene
     assert {(frame.camera.cx, frame.camera.cy) for frame in scene.frames} == {(12.0, 8.0)}
     assert scene.load(found.scene.train)[0].camera.cx == 12.0
-    assert opened(path, trained_by=OURS).load_scene(path).frames[0].camera.cx == pytest.approx(12.2)
+    assert opened(path, trained_by=OURS).with_scene(path).scene.frames[0].camera.cx == pytest.approx(12.2)
     monkeypatch.setitem(cast(dict, PRESETS), "graphdeco", replace(PRESETS["graphdeco"], widest=12))
     assert opened(path, trained_by="graphdeco").scene.sizes[0] == (12, 8)
 
@@ -327,7 +323,7 @@ def test_3dgs_looks_through_the_middle_of_images_of_1600_px_at_most(folder, monk
 def test_fewer_views_are_spread_over_the_cameras(folder):
     path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
     found = opened(path, trained_by=OURS, views="all")
-    scene = found.load_scene(path)
+    scene = found.with_scene(path).scene
     few = found.thinned(scene, 3)
     assert len(few.scene.train) == len(few.scene.sizes) == 3 and set(few.scene.train) < set(found.scene.train)
     assert few.scene.train == sorted(few.scene.train, key=found.scene.train.index)

@@ -14,8 +14,8 @@ from splat.scenes.scene import Scene, load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import open_checkpoint
-from splat.training.origin.foreign import Foreign
 from splat.training.origin.frames import gsplat_frames, nerfstudio_frame, posed, shift_of, shift_to_origin
+from splat.training.origin.options import Foreign
 from tests.refusals import refused
 from tests.splat.model.files import written
 
@@ -87,10 +87,10 @@ def test_whichever_signs_gsplat_had_the_cameras_find_them(tmp_path, scene, varia
     similarity = gsplat_frames(scene)[variant]
     path = tmp_path / "ckpt_1_rank0.pt"
     path.write_bytes(written.gsplat_pt(carried(flat(torch.float32), similarity)))
-    found = open_checkpoint(path, Foreign(tmp_path / "scene"), tmp_path / "mismatch.png")
+    found = open_checkpoint(path, Foreign(scene=tmp_path / "scene"), path)
     assert found.scene.similarity is not None and found.origin
     np.testing.assert_allclose(found.scene.similarity, similarity, rtol=1e-9, atol=1e-12)
-    camera = found.load_scene(path).frames[0].camera
+    camera = found.with_scene(path).scene.frames[0].camera
     expected = similarity[:, :3] @ scene.frames[0].camera.centre.numpy() + similarity[:, 3]
     np.testing.assert_allclose(camera.centre.numpy(), expected, atol=1e-12)
 
@@ -180,7 +180,7 @@ def test_another_tools_gaussians_are_probed_near_the_origin(tmp_path, exported_n
     file = near if exported_near else carried(flat(), np.column_stack([np.eye(3), away]))
     path = tmp_path / "a.ply"
     path.write_bytes(splat_ply(file.to(torch.float32)))
-    found = open_checkpoint(path, Foreign(tmp_path / "scene", trained_by="gsplat-raw"), tmp_path / "mismatch.png")
+    found = open_checkpoint(path, Foreign(scene=tmp_path / "scene", trained_by="gsplat-raw"), path)
     assert found.scene.similarity == shift.tolist()
     rounding = 1e-6 if exported_near else np.spacing(np.float32(60000))
     assert (found.training.gaussians.means - near.means).abs().max() <= rounding
