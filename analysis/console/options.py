@@ -22,9 +22,7 @@ from tyro.constructors import (
 from splat.training.origin.options import Foreign, Trainer
 
 DeviceName = Literal["auto", "cpu", "cuda"]
-Device = Annotated[
-    DeviceName, arg(metavar="NAME", help="cpu, cuda; auto: the GPU where there is one that can be used.")
-]
+Device = Annotated[DeviceName, arg(metavar="NAME", help="cpu, cuda; auto: a GPU that can be used, else the CPU.")]
 QUIET = "quiet"  # a mark of dataclasses that `registry` has read
 
 
@@ -78,8 +76,6 @@ CheckpointPath = Annotated[
         help="RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply.",
     ),
 ]
-MostMemory = Annotated[
-    str | None, arg(help="The most memory to take, such as 8GB; else what would fit is said.\nDefault: what is free.")
-]
+MostMemory = Annotated[str | None, arg(help="The most memory to take, such as 8GB.  Default: what is free.")]
 GROUP = arg(name="other-tools", help="--scene and the last two are of our own checkpoints too.")
 OfTrainer, OtherTools = Annotated[Trainer, GROUP], Annotated[Foreign, GROUP]

@@ -46,11 +46,11 @@ class SliceOptions:
     max_renders: int | None = None
     """Points that are rendered at most, with those before an interruption.  Default: no limit."""
     workers: int | None = None
-    """Points rendered at a time, each on one thread.  Default: one for each processor; one on a GPU."""
+    """Points rendered at a time.  Default: one for each processor; one on a GPU."""
     device: Device = "auto"
     seed: int = 0
-    """Seed of random directions, of the start of Lanczos, and of the points that judge the interpolation."""
+    """Seed of random directions, Lanczos's start, and the points that judge the interpolation."""
     out: Path | None = None
-    """Folder of the results.  Default: beside the checkpoint, such as slice-eigenvectors-2d or slice-line-1d."""
+    """Folder of the results.  Default: such as slice-line-1d, beside the checkpoint."""
     memory: MostMemory = None
     foreign: OtherTools = field(default_factory=Foreign)
