@@ -27,6 +27,7 @@ from splat.training.origin.fingerprint import Fingerprint
 
 if TYPE_CHECKING:
     from splat.curvature.objective import ActiveCounts, SceneObjective
+    from splat.losses.reference import LossSettings
 
 ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
@@ -329,12 +330,31 @@ def recorded_probe(folder: Path, asked: Fingerprint, notes: list[str]) -> Record
     return record if "largest" in record.arrays.get("eigenvectors", {}) else None
 
 
+def loss_name(loss: "LossSettings") -> str:
+    """The loss as a formula in words.
+
+    >>> from splat import LossSettings
+    >>> loss_name(LossSettings()), loss_name(LossSettings("charbonnier", 0.0, eps=0.001))
+    ('0.8 L1 + 0.2 (1 − SSIM)', 'Charbonnier (eps 0.001)')
+    >>> loss_name(LossSettings(opacity_reg=0.01, scale_reg=0.02))
+    '0.8 L1 + 0.2 (1 − SSIM) + 0.01 mean opacity + 0.02 mean scale'
+    """
+    pixel = {"l1": "L1", "l2": "L2", "charbonnier": f"Charbonnier (eps {loss.eps:g})"}[loss.pixel]
+    terms = [pixel if loss.pixel_weight == 1 else f"{loss.pixel_weight:g} {pixel}"]
+    if loss.ssim_weight:
+        windows = " of windows within the image" if loss.border == "valid" else ""
+        terms.append(f"{loss.ssim_weight:g} (1 − SSIM{windows})")
+    regularizers = {"opacity": loss.opacity_reg, "scale": loss.scale_reg}
+    terms += [f"{weight:g} mean {name}" for name, weight in regularizers.items() if weight]
+    return " + ".join(terms)
+
+
 def objective_of(
     objective: "SceneObjective", value: float, gradient_norm: float, views_error: Maybe[Number] = UNSET
 ) -> schema.Objective:
     """What a record says of its loss."""
     return schema.Objective(
-        loss=objective.loss_settings.formula,
+        loss=loss_name(objective.loss_settings),
         sizes=[(view.camera.width, view.camera.height) for view in objective.views],
         background=tuple(objective.background.tolist()),
         operator="hessian",

@@ -70,24 +70,6 @@ class LossSettings(Settings):
     def pixel_weight(self) -> float:
         return 1.0 if self.literal else 1.0 - self.ssim_weight
 
-    @property
-    def formula(self) -> str:
-        """The loss in words.
-
-        >>> LossSettings().formula, LossSettings("charbonnier", 0.0, eps=0.001).formula
-        ('0.8 L1 + 0.2 (1 − SSIM)', 'Charbonnier (eps 0.001)')
-        >>> LossSettings(opacity_reg=0.01, scale_reg=0.02).formula
-        '0.8 L1 + 0.2 (1 − SSIM) + 0.01 mean opacity + 0.02 mean scale'
-        """
-        pixel = {"l1": "L1", "l2": "L2", "charbonnier": f"Charbonnier (eps {self.eps:g})"}[self.pixel]
-        terms = [pixel if self.pixel_weight == 1 else f"{self.pixel_weight:g} {pixel}"]
-        if self.ssim_weight:
-            windows = " of windows within the image" if self.border == "valid" else ""
-            terms.append(f"{self.ssim_weight:g} (1 − SSIM{windows})")
-        regularizers = {"opacity": self.opacity_reg, "scale": self.scale_reg}
-        terms += [f"{weight:g} mean {name}" for name, weight in regularizers.items() if weight]
-        return " + ".join(terms)
-
 
 def window(dtype: torch.dtype) -> Float[Tensor, "11"]:
     """The normalised 1-D Gaussian; the 2-D window is its outer product."""
