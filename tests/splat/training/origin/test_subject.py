@@ -17,7 +17,7 @@ from splat.training.origin.options import Foreign
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig, Training
 
-MADE = synthetic_scene(SyntheticSettings(gaussians=40, views=5, width=24, height=18))
+MADE = synthetic_scene(SyntheticSettings(gaussians=50, views=5, width=24, height=18))
 
 
 @pytest.fixture
