@@ -78,4 +78,5 @@ CheckpointPath = Annotated[
 ]
 MostMemory = Annotated[str | None, arg(help="The most memory to take, such as 8GB.  Default: what is free.")]
 GROUP = arg(name="other-tools", help="--scene and the last two are of our own checkpoints too.")
-OfTrainer, OtherTools = Annotated[Trainer, GROUP], Annotated[Foreign, GROUP]
+OfTrainer = Annotated[Trainer, GROUP]
+OtherTools = Annotated[Foreign, GROUP]

@@ -51,7 +51,7 @@ def compared(run: Path, options: CompareOptions) -> Checkpoint:
     folder = probe_folder(run)
     made = _made(folder)
     if made and made.origin and made.scene_folder and options.foreign == Foreign():
-        return open_checkpoint(run, _as_probed(made), folder, made.views)
+        return open_checkpoint(run, _as_probed(made), folder, made.views or None)
     return open_subject(run, replace(options.foreign, max_views=None), folder).checkpoint
 
 
