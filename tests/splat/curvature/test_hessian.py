@@ -20,7 +20,7 @@ from splat.model.gaussians import Gaussians
 from splat.projection.reference import project
 from splat.render.reference import rasterize_reference
 from splat.render.render import render
-from tests.refusals import refused
+from tests.refusals import misused, refused
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, mean_loss, two_views
 from tests.splat.random_scenes import random_gaussians, random_like
 from tests.splat.tolerances import errors_by_block, relative_error
@@ -207,7 +207,7 @@ def test_what_cannot_be_an_objective_is_refused():
     broken.sh[4, 1, 2] = float("inf")
     refused(r"expected finite sh, got .*inf.* at Gaussian 4", objective, broken)
     H = SceneHessian(objective(gaussians))
-    refused(r"use V\[:, None\]", H.apply, torch.zeros(H.dim, dtype=torch.float64))
+    misused(r"use V\[:, None\]", H.apply, torch.zeros(H.dim, dtype=torch.float64))
 
 
 def test_parameters_that_require_a_gradient_are_taken_as_numbers():
