@@ -187,7 +187,7 @@ def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
     axes.contour(x, y, change, levels=levels, colors=BLACK, linewidths=0.4)
     reach = scale.reach / steps
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    for axis in (axes.xaxis, axes.yaxis):  # as many at any size: the layout counts the room of those at its first one
+    for axis in (axes.xaxis, axes.yaxis):  # as many at any size: the layout counts their room at its first size
         axis.set_major_locator(MaxNLocator(4))
     axes.set_xlabel(scale.flat_label("e₁"))
     axes.set_ylabel(scale.step_label("e₂"))

@@ -92,7 +92,7 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
         unbounded = ~np.isfinite(ends).all(axis=0)
         low = np.fmin(np.nanmin(ends, axis=0, initial=np.inf), magnitudes)
         shown = np.where(unbounded, low, magnitudes)
-        shown[shown == 0] = np.nan  # of which a logarithmic axis has no place
+        shown[shown == 0] = np.nan  # for which a logarithmic axis has no place
         high = np.where(unbounded, shown, np.fmax(ends.max(axis=0), magnitudes))
         axes.fill_between(steps, np.where(shown > 0, low, np.nan), high, color=colour, alpha=0.25, linewidth=0)
         axes.plot(steps, shown, color=colour, linewidth=1.1 * broad)

@@ -98,7 +98,7 @@ def standard_deviation(samples: Float64[Tensor, "s *shape"]) -> Float64[Tensor, 
 
 
 def sampling_error(terms: Float64[Tensor, " m"], population: int) -> Number:
-    """Error of the mean of m terms as that of all `population` of which they are, had they been drawn at random.
+    """Error of the mean of m terms, drawn at random from `population` terms, as an estimate of the mean of all.
 
     q s sqrt(1/m - 1/M), with the terms' standard deviation s, which errors of their own make larger; 0 where they are all,
     None of a single one.  q, 1 for many terms, is Student's factor: twice the error holds as often as two standard errors do.
@@ -119,7 +119,7 @@ def sampling_error(terms: Float64[Tensor, " m"], population: int) -> Number:
 
 @dataclass(frozen=True)
 class Bracket:
-    """A number derived from other results, and bounds [low, high] that carry the errors of those results.
+    """A number derived from other results, and bounds [low, high] that carry their errors.
 
     value: None where the number is undefined or cannot be determined.  low, high: may be infinite.  note: the assumption or
     the limit behind the bounds, in a few words.

@@ -34,8 +34,8 @@ SIZES = ("10k@504x378", "100k@504x378")
 ON_BOTH = (("block diagonal", "gradient", 3.0), ("linearize", "gradient", 4.0))
 ON_CPU = (("gradient", "rasterizer", 2.5), ("H v 1", "gradient", 1.6), ("H v 4", "gradient", 1.0))
 ON_GPU = (("H v 1", "gradient", 2.0), ("H v 8", "gradient", 1.2))
-# and of bytes: of what a linearisation keeps, for a visible Gaussian, a pixel and a tile entry; the same of the workspace for
-# each vector of a product.  10,000 Gaussians at 504 x 378 take 0.55 of the first and 0.74 of the second in single precision
+# and of bytes: kept by a linearisation, for a visible Gaussian, a pixel and a tile entry; the same for the workspace of each
+# vector of a product.  10,000 Gaussians at 504 x 378 take 0.55 of the first and 0.74 of the second in single precision
 KEPT, WORKSPACE = (1000, 200, 24), (500, 28, 40)
 
 

@@ -100,6 +100,6 @@ class ViewBench:
 
 
 def per_vector(times: Mapping[str, Timing]) -> dict[str, Timing]:
-    """Times of what is named after a number of vectors, "H v 4", per vector; the rest as it is."""
+    """Times per vector where the name ends in a number of vectors, as "H v 4"; the others as they are."""
     widths = {name: name.rsplit(" ", 1)[-1] for name in times}
     return {name: time / int(widths[name]) if widths[name].isdigit() else time for name, time in times.items()}

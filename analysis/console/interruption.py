@@ -16,7 +16,7 @@ SAID = "ending after this step; another one ends it at once"
 
 
 class Interrupted(KeyboardInterrupt):
-    """The end of what looked at the flag.  exit_code: 128 + the number of the signal, as shells have it."""
+    """Raised by `look` once the flag is set.  exit_code: 128 + the number of the signal, as shells have it."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"interrupted by {signal.Signals(number).name}")

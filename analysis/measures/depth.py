@@ -1,7 +1,7 @@
 """Derivatives of the positions along the rays (depth) and across them (lateral), and finite steps both ways.
 
 v_im is the unit vector from the centre of view m's camera to the mean of Gaussian i, as in Eq. (7); g_im and H_im are the
-gradient and the 3 x 3 diagonal block of the Hessian of that view's loss in that mean.
+gradient and the 3 x 3 diagonal block of the Hessian of the view's loss in the mean.
 
               depth            lateral: two directions        summed over
     gradient  (g . v)^2        |g|^2 - (g . v)^2              pairs of a Gaussian and a view with g != 0

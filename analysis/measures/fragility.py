@@ -26,7 +26,7 @@ from splat.projection.reference import NEEDLE
 from splat.render.sight import Sight
 
 LENGTHS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # px
-PAIRS = 24  # of which the jump is measured
+PAIRS = 24  # whose jump is measured
 MARGIN = 1e-3  # of the way, before and behind the place of a swap; at least so many units of round-off of the depth:
 ROUND_OFFS = 8
 ALONE = 0.9
@@ -82,7 +82,7 @@ def _ranks(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
 
 
 def swaps(objective: SceneObjective, sights: Sequence[Sight], generator: torch.Generator, progress: Progress) -> Swaps:
-    """Shares of the pairs that ways of LENGTHS swap, by view; and the jump of the loss at PAIRS of those within the longest."""
+    """Shares of the pairs that ways of LENGTHS swap, by view; and the jump of the loss where PAIRS of them swap."""
     gaps = [sight.gap[sight.gap.isfinite()] for sight in sights]
     within = [(m, int(i)) for m, sight in enumerate(sights) for i in (sight.gap <= LENGTHS[-1]).nonzero()[:, 0]]
     order = torch.randperm(len(within), generator=generator)[:PAIRS].tolist()
@@ -133,12 +133,12 @@ def fragility_sentences(found: Fragility) -> list[str]:
     conditioning = (
         f"Conditioning: {percent(found.needles)} of the Gaussians are needles (condition above {NEEDLE:.0f}, longer than "
         f"{sqrt(NEEDLE):.0f} : 1); so are {rotation} of the "
-        f"{STEEPEST:.0%} that are steepest in rotation, and {scale} of those in scale."
+        f"{STEEPEST:.0%} that are steepest in rotation, and {scale} in scale."
     )
     opacity = f"Opacity: {percent(found.one_view)} of the Gaussians have over {ALONE:.0%} of their weight in one view"
     if found.one_view_trace is not None:
         opacity += f" and hold {percent(found.one_view_trace)} of opacity's curvature"
     if found.opacity_one_view is not None:
-        opacity += "; rank correlation of that share with the curvature in opacity: "
+        opacity += "; rank correlation between this share and the curvature in opacity: "
         opacity += quantity(found.opacity_one_view)
     return [position, conditioning, f"{opacity}."]

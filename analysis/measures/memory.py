@@ -19,7 +19,7 @@ GIB = 2**30
 
 
 def vectors_within(objective: SceneObjective, memory: float) -> int:
-    """Number of vectors of the active parameters that fit into so many GiB, and into half of what is free there."""
+    """Number of vectors of the active parameters that fit into so many GiB, and into half of the free memory."""
     flat = objective.active.flat
     return int(min(memory * GIB, free_memory(flat.device) / 2) // flat.nbytes)
 
@@ -93,7 +93,7 @@ def expected_peak(objective: SceneObjective) -> int:
         )
         raise TooLittleMemory(
             f"expected at least {_size(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
-            f"{camera.width} x {camera.height} px, got {_size(used + free)}, of which {_size(used)} are taken; "
+            f"{camera.width} x {camera.height} px, got {_size(used + free)}, {_size(used)} of them taken; "
             f"{enough} would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
         )
     objective.memory = min(free // 2, max(free - needs.beside, needs.view))

@@ -75,7 +75,7 @@ class PerAttributeOptions:
 
     @property
     def products(self) -> float:
-        """Expected number of products with a batch of vectors, of the cost of those of the trained scene."""
+        """Expected number of products with a batch of vectors, in units of a product of the trained scene."""
         return len(OPERATORS) * PARTS * PRODUCTS * (1 + SPLIT * self.split_control)
 
 

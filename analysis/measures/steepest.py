@@ -264,7 +264,7 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
     some = "both" if count == 2 else f"all {count}"
     seen = "one view" if first.views == 1 else f"{some if first.views == count else f'{first.views} of {count}'} views"
     if first.views > 1 and first.one_view >= 0.9:
-        seen += f", one of which has {first.one_view:.0%} of its weight"
+        seen += f", with {first.one_view:.0%} of its weight in one"
     alone = "" if first.share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
     return (
         f"{percent(first.share)} of {end.name}, {end.title}, lies on Gaussian {first.gaussian:,}, which it {VERBS[name]}: "

@@ -217,7 +217,7 @@ def is_open(index: schema.Index) -> bool:
     return missing == 1 or (missing == 2 and index.value is not None)
 
 
-def is_wide(index: schema.Index | schema.Effect) -> bool:
+def is_wide(index: schema.Index) -> bool:
     """Whether its bracket includes 0 or its ends differ by more than WIDEST: no value is shown."""
     if index.low is None or index.high is None:
         return False

@@ -24,16 +24,10 @@ Count = Annotated[int, Meta(ge=0)]
 Sign = Literal["positive", "negative", "zero", "undetermined"]
 Operator = Literal["hessian", "gauss-newton"]
 IndexName = Literal["eigenvalue_ratio", "negative_ratio", "top_mass", "participation_ratio"]
-
-
 ROUND_OFF = 1e-6  # by which numbers may leave their order or [0, 1]
 NonNegative = Annotated[float, Meta(ge=0)]
+Size = NonNegative | None
 Portion = Annotated[float, Meta(ge=-ROUND_OFF, le=1 + ROUND_OFF)]
-
-
-def _require_error(name: str, value: Number) -> None:
-    if value is not None and value < 0:
-        raise ValueError(f"Expected `{name}` of at least 0, got {value}")
 
 
 def require_order(**values: "Number | Maybe[Number]") -> None:
@@ -64,13 +58,9 @@ class Objective(Struct, kw_only=True):
     sizes: list[tuple[int, int]] | None = None
     background: tuple[float, float, float] | None = None
     operator: Operator | None = None
-    value: Number = None
-    gradient_norm: Number = None
+    value: Size = None
+    gradient_norm: Size = None
     views_error: Maybe[Number] = UNSET
-
-    def __post_init__(self) -> None:
-        _require_error("value", self.value)
-        _require_error("gradient_norm", self.gradient_norm)
 
 
 class TraceOf(Struct, kw_only=True):
@@ -85,7 +75,7 @@ class TraceOf(Struct, kw_only=True):
     """
 
     value: Number
-    standard_error: Number
+    standard_error: Size
     low: Number = None
     high: Number = None
     confidence: Number = None
@@ -99,7 +89,6 @@ class TraceOf(Struct, kw_only=True):
     views_error: Maybe[Number] = UNSET
 
     def __post_init__(self) -> None:
-        _require_error("standard_error", self.standard_error)
         require_order(low=self.low, value=self.value, high=self.high)
 
     @property
@@ -128,11 +117,7 @@ class TraceOf(Struct, kw_only=True):
 class Trace(TraceOf, kw_only=True):
     """Trace of one attribute's block.  dim: its directions that are not exactly flat; tau: sqrt(max(value, 0) / dim)."""
 
-    tau: Number
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require_error("tau", self.tau)
+    tau: Size
 
 
 class LivesOn(Struct, kw_only=True):
@@ -162,15 +147,12 @@ class End(Struct, kw_only=True):
     """
 
     value: Number
-    residual: Number
+    residual: Size
     vector_error: Number = None
     reason: str | None = None
     note: Maybe[str] = UNSET
     views_error: Maybe[Number] = UNSET
     without_one: Maybe[tuple[float, float]] = UNSET
-
-    def __post_init__(self) -> None:
-        _require_error("residual", self.residual)
 
     @property
     def is_reached(self) -> bool:
@@ -272,11 +254,8 @@ class Anisotropy(Named[Index], kw_only=True):
         """All but `eigenvalue_ratio`, whose denominator may be 0, are in brackets; a mass is at most 1, none is negative."""
         for name, found in self.items():
             if name != "eigenvalue_ratio":
+                require_order(zero=0.0, value=found.value, one=1.0 if name == "top_mass" else None)
                 require_order(low=found.low, value=found.value, high=found.high)
-            if name != "eigenvalue_ratio":
-                _require_error(name, found.value)
-            if name == "top_mass":
-                require_order(top_mass=found.value, one=1.0)
 
 
 INDICES = Anisotropy.__struct_fields__
@@ -330,24 +309,17 @@ class Rise(Struct, kw_only=True):
     lateral_crossed: Portion
 
 
-class DepthTraces(Struct, kw_only=True):
-    """Traces of the positions' curvature, along the rays and across them."""
-
-    depth: TraceOf
-    lateral: TraceOf
-
-
 class Depth(Struct, kw_only=True):
     """Derivatives of the positions along the rays, over those in one direction across them (`analysis.measures.depth`).
 
     gradient_ratio: of root mean squares over `pairs` of a Gaussian and a view; gradient_median: median of the pairs' ratios.
-    curvature: the traces.  curvature_ratio: of the mean curvatures.  rises: one for each length of steps.
+    curvature: its traces both ways.  curvature_ratio: of the mean curvatures.  rises: one for each length of steps.
     """
 
     gradient_ratio: Number
     gradient_median: Number
     pairs: Count
-    curvature: DepthTraces
+    curvature: dict[Literal["depth", "lateral"], TraceOf]
     curvature_ratio: Index
     rises: list[Rise]
 
@@ -395,16 +367,12 @@ class BlockAnisotropy(Struct, kw_only=True):
     matvecs: Count = 0
 
 
-class Effect(Struct, kw_only=True):
-    """Ratio of an index of the split scene to that of the trained one: value, low, high, note as for `Index`."""
+class Effect(Index, kw_only=True):
+    """Ratio of an index of the split scene to that of the trained one."""
 
     operator: Operator
     block: str
     index: IndexName
-    value: Number
-    low: Number
-    high: Number
-    note: str
 
 
 class SplitControl(Struct, kw_only=True):

@@ -238,7 +238,7 @@ def _folded(text: str, width: int = WIDTH) -> str:
     return text if len(text) <= width else text.replace(PLUS_MINUS, f"\n±{HARD}").replace(" … ", " …\n")
 
 
-def bracketed(index: Index | Effect | None) -> Cell:
+def bracketed(index: Index | None) -> Cell:
     """An index as text: with a narrow bracket as its error; the bound alone of an open bracket; a wide bracket alone.
 
     >>> bracketed(Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")).value

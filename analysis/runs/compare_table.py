@@ -172,7 +172,7 @@ def _end(end: End) -> Entry:
     return Entry(value, cell, value - residual, value + residual)
 
 
-def _index(index: Index | Effect | None, cell: Cell | None = None) -> Entry:
+def _index(index: Index | None, cell: Cell | None = None) -> Entry:
     """cell: how it is written, where not as `bracketed` has it."""
     return MISSING if index is None else Entry(index.value, cell or bracketed(index), index.low, index.high)
 

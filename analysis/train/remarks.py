@@ -39,7 +39,7 @@ def remarks(
     view: View,
 ) -> list[str]:
     """asked, config: the settings, not scaled and scaled, without what a checkpoint brings; begun: the start and its Gaussians,
-    None where there is a checkpoint; view: one of those to train on."""
+    None where there is a checkpoint; view: one to train on."""
     found = [*scene.notes, begun and poor_start(scene, *begun), _scaled(asked, config), _not_reached(config)]
     found += [*_of_second_order(config), removes_for_size(training, view), cut_by_near(training, view)]
     return [words for words in found if words]
@@ -105,7 +105,7 @@ def poor_start(scene: Scene, source: Source, gaussians: int) -> str:
     """
     kind = _kind(scene, source)
     if kind in ("random", "box"):
-        return f"it starts from {gaussians:,} random points, of which most lie on no surface; {HOW_TO_START[kind]}"
+        return f"it starts from {gaussians:,} random points, and most lie on no surface; {HOW_TO_START[kind]}"
     few = f"it starts from {gaussians:,} points only, and may leave places empty; {HOW_TO_START[kind]}"
     return few if gaussians < FEW else ""
 

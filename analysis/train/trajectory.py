@@ -26,7 +26,7 @@ Columns:
     lambda_max, lambda_min    with _error (residual) and _reason (why the search ended)
     eigenvalue_ratio, negative_ratio, top_mass, participation_ratio
                            indices (`landscape.spectrum.anisotropy`), with _low and _high; the last two of whole records
-    of_data, of_question, of_state, of_formulas    digests of what the record is about (`splat.training.origin.fingerprint`)
+    of_data, of_question, of_state, of_formulas    digests of its subject (`splat.training.origin.fingerprint`)
 """
 
 from collections.abc import Sequence

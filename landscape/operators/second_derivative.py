@@ -103,7 +103,7 @@ class _Differences:
                 rounding = self.rounding(eps)
             elif float((found - self.over(2 * step)).norm()) <= SETTLED * apart and rounding / step <= SETTLED * apart:
                 return apart / size
-            # the step at which round-off is a tenth of what is to be resolved; nearer where the gradient is not finite
+            # the step at which round-off is a tenth of the change to be resolved; nearer where the gradient is not finite
             step = max(10 * rounding / (SETTLED * apart), eps * scale / SETTLED) if isfinite(apart) else share * step
         return -1.0
 

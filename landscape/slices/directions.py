@@ -112,7 +112,7 @@ def line_between(start: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[
 def orthonormal(directions: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
     """Unit directions at right angles: the first one, and the part of each other one that is orthogonal to those before.
 
-    Raises InputError where one is zero or not finite, or lies in the span of those before.
+    Raises InputError where one is zero or not finite, or lies in the span of earlier ones.
 
     >>> orthonormal(torch.tensor([[3.0, 1.0], [4.0, 1.0]]))
     tensor([[ 0.6000,  0.8000],

@@ -31,8 +31,8 @@ class SliceSettings:
     """Rules for the points of a plane to evaluate; the others are interpolated.
 
     tolerance: of the interpolation, as a share of the range of the values; None: every point is evaluated.
-    holdout: random points of a hold-out, at least.  From 64 of which the largest error is within the tolerance follows, with
-        97.5% confidence, that at most 5.6% of the others are not; the bound extrapolates to all.
+    holdout: fewest random points of a hold-out.  Where the largest error at 64 of them is within the tolerance, at most 5.6% of
+        the other points are not, with 97.5% confidence; the bound extrapolates to all.
     workers: threads that evaluate.
     max_evaluations, max_seconds: budgets for what comes after the axes, which are always evaluated.  max_evaluations counts
         these and the one at the centre, and those of a store; time counts from the call.  Allowed only with a tolerance.

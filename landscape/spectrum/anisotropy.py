@@ -66,8 +66,8 @@ def anisotropy(ends: EigenEnds, density: SpectralDensity | None = None) -> Aniso
 def eigenvalue_ratio(ends: EigenEnds) -> Bracket:
     """lambda_max / lambda_min, signed: StableGS's Eq. (3).
 
-    The value is always the quotient of what was found; where lambda_min may be 0, the bracket is that of its modulus instead,
-    with no upper bound.  The note says so, or else whether the operator is definite, as far as lambda_max tells.
+    The value is always the quotient of the two ends found.  Where lambda_min may be 0, the bracket is for its modulus, and has
+    no upper bound.  The note says so, or else whether the operator is definite, as far as lambda_max tells.
     """
     top, bottom = _intervals(ends)
     smallest = float(ends.smallest.values[0])

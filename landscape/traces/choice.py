@@ -1,6 +1,6 @@
 """The choice of a method for a trace, made from the first probes of Hutchinson's estimator.
 
-k probes z_i of random signs have cost k products y_i = H z_i.  There are three ways to go on, none of which wastes them:
+k probes z_i of random signs have cost k products y_i = H z_i.  There are three ways to go on, and each uses them:
 
     hutchinson  more probes.  The variance after m probes is 2 p_2 / m, where p_2 = |H|_F^2 without the diagonal is estimated
                 from the pairs of probes (`quadratic`)

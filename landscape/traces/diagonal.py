@@ -7,8 +7,8 @@
 
     a_i = z_i * (H z_i),   diag H ~ mean of a_i,   variance of an entry: the squares of the other entries of its row, over k
 
-As in `choice`, a sketch pays where 4 r is below the variance of one a_i, summed over the entries; r is the square of what lies
-outside the sketch.
+As in `choice`, a sketch pays where 4 r is below the variance of one a_i, summed over the entries; r is the squared norm of
+the part outside the sketch.
 """
 
 from collections.abc import Mapping

@@ -45,7 +45,7 @@ class TraceEstimate:
         matvecs: int = 0,
         terms: Float64[Tensor, " m"] | None = None,
     ) -> "TraceEstimate":
-        """A trace without error, no part of which was sampled."""
+        """A trace without error: nothing of it was sampled."""
         none = torch.zeros(0, dtype=torch.float64)
         return cls(block, dim, value, 0.0, value, value, confidence, 0, matvecs, "exact", none, "exact", terms)
 

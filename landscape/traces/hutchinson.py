@@ -190,7 +190,7 @@ class Hutchinson:
         return {name: power_sums(Z[rows], Y[rows], kind) for name, rows in self.rows.items()}
 
     def _estimates(self, reason: StopReason) -> dict[str, TraceEstimate]:
-        """The estimates so far.  reason: of those that have not reached the tolerance."""
+        """The estimates so far.  reason: for estimates that have not reached the tolerance."""
         settings, results, opened = self.settings, {}, self._open_groups()
         probes = self.samples.shape[1]
         widening = WIDENING if settings.adaptive else 1.0

@@ -17,8 +17,8 @@ grow together, in proportion for one eigenvalue: trace = k m / chi^2_k.  With th
     ends    m + s ((1 - e^2 + e q)^-3 - 1) / (3 e),   e = sqrt(2 / k) c / 3,   s^2 = (2 p_2 / k) (1 + 2 c^2 / k)
 
 which is m - s q for e = 0.  q: quantiles of Student's t whose degrees of freedom are two over the relative variance of s^2.
-The part of that variance that is common to s and m is no error, and is subtracted as c^6 times its value for one eigenvalue; in
-theory the factor is c^2, and c^6 subtracts less where c is uncertain.
+The variance that s and m share is no error.  It is subtracted as c^6 times its value for one eigenvalue; in theory the factor
+is c^2, and c^6 subtracts less where c is uncertain.
 
 The interval is too short where random signs see few entries off the diagonal: all samples can then be equal by chance.  It is
 slightly too short where two eigenvalues of opposite signs dominate.

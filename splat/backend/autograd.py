@@ -19,5 +19,5 @@ class _Last(torch.autograd.Function):
 
 
 def last_derivative(values: tuple[Tensor, ...], *sources: Tensor) -> tuple[Tensor, ...]:
-    """Derivatives by a kernel: on the graph of what they came from, so that the next is refused, not taken for 0."""
+    """Derivatives by a kernel: on the graph of their inputs, so that the next is refused, not taken for 0."""
     return _Last.apply(len(values), *values, *sources)  # pyright: ignore[reportReturnType]

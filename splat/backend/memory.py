@@ -1,6 +1,6 @@
 """How much memory is free: on a GPU, or for this process within what the system, its control group and `--memory` leave.
 
-One number, of which a plan is made.  Beyond it Python raises MemoryError, or the system ends a process.
+One number, from which a plan is made.  Beyond it Python raises MemoryError, or the system ends a process.
 """
 
 from collections.abc import Iterator
@@ -52,7 +52,7 @@ def free_memory(device: "torch.device") -> int:
 
 
 def _of_groups() -> Iterator[int]:
-    """What the limits of the process's control group leave, and of those that it is in; what caches files can be had."""
+    """Room within the limits of the process's control group and of each group around it; caches of files count as free."""
     name = next((line[4:] for line in _lines(GROUP) if line.startswith("0::/")), None)
     for group in [] if name is None else [GROUPS / name, *(GROUPS / name).parents[: len(Path(name).parts)]]:
         most, used = ("".join(_lines(group / file)) for file in ("memory.max", "memory.current"))

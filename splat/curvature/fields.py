@@ -136,7 +136,7 @@ def block_fields(
 
 
 def sight_fields(sights: Sequence[Sight]) -> Values:
-    """The fields of what the views see."""
+    """The fields that tell how the views see each Gaussian."""
     weight = torch.stack([each.weight for each in sights])
     total = weight.sum(dim=0)
     return {

@@ -38,7 +38,7 @@ class LinearLoss(Protocol):
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept, the target's included."""
+        """Bytes kept in memory, the target's included."""
         ...
 
     def scalar(self, like: Tensor) -> Float[Tensor, ""]:

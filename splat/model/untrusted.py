@@ -44,7 +44,7 @@ TAKEN = "expected {what}, got another at work, which holds {path}; wait until it
 
 
 def require_modest(archive: zipfile.ZipFile) -> None:
-    """InputError where the members of an archive, some of which may share their bytes, are far larger than the file."""
+    """InputError where the members of an archive, which may share their bytes, are far larger than the file."""
     assert archive.fp is not None
     size, held = archive.fp.seek(0, os.SEEK_END), sum(member.file_size for member in archive.infolist())
     if held > EXPANSION * size + SLACK:

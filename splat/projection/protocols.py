@@ -25,7 +25,7 @@ class Projection(Protocol):
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept."""
+        """Bytes kept in memory."""
         ...
 
     def affects(self, block: Float[Tensor, "p k"]) -> bool:

@@ -45,7 +45,7 @@ class Adjoint(Protocol):
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept beside the cotangent."""
+        """Bytes kept in memory beside the cotangent."""
         ...
 
 
@@ -96,12 +96,12 @@ class Raster(Protocol):
 
     @property
     def draw_order(self) -> int:
-        """The same number for rasters of which every tile draws the same splats in the same order."""
+        """A number that is equal for rasters whose tiles all draw the same splats in the same order."""
         ...
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept."""
+        """Bytes kept in memory."""
         ...
 
     def workspace(self, vectors: int) -> int:

@@ -23,10 +23,9 @@ class Sight:
 
     weight: sum over the pixels of alpha T, px.  pixels: in how many it is not 0.  means: of the splats, px.  depths: z, world
     units.  condition: of the splat's covariance, lambda_max / lambda_min with the blur; 1 where it is not seen.
-    front: the Gaussian next in front of it, in the order in which they are drawn, among those that have weight in one of its
-    pixels; -1 where there is none.  gap: f (z - z_front) / z, px: a Gaussian that moves along its ray towards the camera by
-    this much changes places with `front`, where a pixel is the length |mean - centre| / f that moves it by a pixel across the
-    ray; infinite where there is none.
+    front: the nearest Gaussian in front of it, in drawing order, that has weight in one of its pixels; -1 where there is none.
+    gap: f (z - z_front) / z, px: how far it moves along its ray towards the camera until it passes `front`; infinite without
+    one.  A pixel is here the length |mean - centre| / f: such a step across the ray moves the splat by a pixel.
     """
 
     weight: Float64[Tensor, " n"]
@@ -39,7 +38,7 @@ class Sight:
 
     @property
     def seen(self) -> Bool[Tensor, " n"]:
-        """Mask of those with weight in a pixel."""
+        """Mask of the Gaussians with weight in a pixel."""
         return self.pixels > 0
 
 

@@ -45,7 +45,7 @@ UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.De
 
 
 class _File(io.BufferedReader):
-    """A file, of which no more bytes are asked for than there are: a chunk of a PNG may announce 2 GiB."""
+    """A file that is never asked for more bytes than it has: a chunk of a PNG may announce 2 GiB."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
@@ -123,8 +123,8 @@ def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
     between = float((low < UNCLEAR[1] * white)[(high > UNCLEAR[0] * white)].mean())
     if between > MOST_UNCLEAR or 1 < white <= MOST_LABELS:
         raise InputError(
-            f"expected a mask of black outside and white inside, got numbers up to {white} and {between:.0%} of what is not "
-            f"black in colours or half dark in {path}: labels, or a soft mask; write 255 for what counts and 0 for all else"
+            f"expected a mask of black outside and white inside, got numbers up to {white} and {between:.0%} of the pixels "
+            f"that are not black in colours or half dark in {path}: labels, or a soft mask; write 255 for what counts, else 0"
         )
     return torch.from_numpy(low >= white / 2).to(torch.float32)[None]
 

@@ -192,7 +192,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def _instead(path: Path) -> str:
-    """Description of what is at path in place of a checkpoint, and which path to name instead."""
+    """Description of the thing at path that is no checkpoint, and which path to name instead."""
     if not path.exists():
         near = path.parent if path.name == "checkpoint.pt" else path
         beside = [each.name for each in near.parent.iterdir()] if near.parent.is_dir() else []

@@ -50,7 +50,7 @@ def prepare(training: Training, views: Sequence[View]) -> None:
     """Get ready for steps on these views; a second call changes nothing.
 
     InputError where there are no views, they lack what the method needs, none draws a Gaussian, or no part of the method would
-    begin.  A method of which every part is switched off is 3DGS, the base that it is compared with.
+    begin.  A method with every part switched off is 3DGS, the base that it is compared with.
     """
     config = training.config
     if not views:
@@ -113,7 +113,7 @@ def _require_in_sight(training: Training, views: Sequence[View]) -> None:
             return
         nearer = max(nearer, int(inside_image(camera, gaussians.means.double(), (0.0, settings.near)).sum()))
     raise InputError(
-        f"expected Gaussians that a view draws, got {len(gaussians)}, of which none of {len(views)} views draws one; up to "
+        f"expected Gaussians that a view draws, got {len(gaussians)} that none of {len(views)} views draws; up to "
         f"{nearer} lie nearer than the near plane at {settings.near:g} world units: scale the scene, or lower it with --set "
         "render.near=X"
     )

@@ -145,7 +145,7 @@ def points_in_box(points: Points, generator: torch.Generator) -> Points:
 
 
 def depth_ranges(views: Sequence[View], given: Sequence[tuple[float, float] | None]) -> list[tuple[float, float]]:
-    """The least and greatest z of what each view shows, world units: as given, else by where the cameras look."""
+    """The least and greatest z in each view, world units: as given, else by where the cameras look."""
     return [own or _range_around_target(views, view.camera) for view, own in zip(views, given, strict=True)]
 
 

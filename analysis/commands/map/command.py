@@ -3,7 +3,7 @@
     fields.ply          the Gaussians as 3DGS writes them, and every field (`splat.curvature.fields`) as a property of its
                         name; nan where no view sees a Gaussian
     FIELD.ply           the Gaussians in the colours of one field, grey where it has no value; opens in every viewer
-    top.csv             the hundred Gaussians with the largest values of that field
+    top.csv             the hundred Gaussians with its largest values
     view-NNN.png        each training view: photograph, render, error, and the field composited with the splats' weights
     fragility-NNN.png   each training view: where it is fragile in position, conditioning and opacity
     steepest-*.png      with a probe beside the checkpoint: the Gaussians that carry both ends of the spectrum
@@ -71,7 +71,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
                 f"expected a probe with eigenvectors of this checkpoint in {probe} for --field {options.shown}, got none; "
                 "run landscape probe first"
             )
-        # beside the next stages, none of which uses more than one processor
+        # beside the next stages, which use one processor
         swapping = beside.submit(_fragility, objective, found, options.seed)
         with stages.stage("maps") as report:
             shades = {name: found.shade(name) for name in dict.fromkeys((options.shown, *AXES))}

@@ -21,7 +21,7 @@ TOP = 100
 
 
 def fields_ply(gaussians: Gaussians, seen: Bool[Tensor, " n"], values: Values) -> bytes:
-    """All Gaussians with the fields of those in sight, nan for the others."""
+    """All Gaussians with their fields, nan out of sight."""
     extra = {}
     for name, column in values.items():
         extra[name] = np.full(len(gaussians), np.nan, np.float32)

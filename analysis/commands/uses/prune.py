@@ -2,7 +2,7 @@
 
     checkpoint.pt, pruned.ply   the Gaussians that are kept
     scores.csv          every score (`splat.curvature.scores.removal`) of the Gaussians in sight, and `error`, the true rise of
-                        the loss, of those that were removed one at a time
+                        the loss, where one was removed alone
     correlations.csv    rank correlations (Spearman) of the scores with that truth and with each other
     curve.csv           with --curve: PSNR and SSIM by score, share removed, and steps of training after it; curve.png
     prune.json          where it comes from
@@ -54,7 +54,7 @@ L2 = LossSettings("l2", ssim_weight=0)
 REMOVED = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 REFINED = (0.5, 0.9)
 TRUTH = "error"
-CHOICE = ("keep", "score", "refine")  # of what is pruned: what is kept of a curve does not depend on it
+CHOICE = ("keep", "score", "refine")  # about the pruned scene; the curve does not depend on them
 STAGES = ("true removals", *SCORES, *(f"{name} refined" for name in SCORES))
 Row = dict[str, str | int | float]
 
@@ -141,7 +141,7 @@ def refine(training: Training, views: Sequence[View], steps: int, seed: int) -> 
 
 
 def _truth(kept: Kept, objective: SceneObjective, options: PruneOptions) -> Float64[Tensor, " n"]:
-    """The true rise of the loss by removing each Gaussian in sight; nan of those that are not in the sample."""
+    """The true rise of the loss by removing each Gaussian in sight; nan outside the sample."""
     n = len(objective.active)
     generator = torch.Generator().manual_seed(options.seed)
     chosen: Int64[Tensor, " m"] = torch.randperm(n, generator=generator)[: options.sample].sort().values

@@ -1,7 +1,7 @@
 """The page of `landscape view --html`: viser's own of the scene, with a panel that switches the colours of the splats.
 
-Without a server viser's only control is the tree of its nodes, so every field is a node with splats of its own, of which one is
-visible; the panel goes by the tree.
+Without a server viser's only control is the tree of its nodes, so every field is a node with splats of its own.  One
+is visible; the panel switches by the tree.
 """
 
 from pathlib import Path

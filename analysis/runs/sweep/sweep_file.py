@@ -13,7 +13,7 @@
     path = "../data/fern"                    # and any option of `landscape train`, for this scene
     views = 3
 
-    [methods.3dgs]                           # a method of that name at its published settings
+    [methods.3dgs]                           # the method 3dgs at its published settings
     [methods."asp-only"]
     method = "stablegs"                      # and any option of `landscape train`, for this method
     set = { vsp_weight = 0, probe.attributes = ["means"] }
@@ -131,7 +131,7 @@ def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -
 
 
 def _options(options: Mapping[str, Any], seed: int, out: Path) -> TrainOptions:
-    """Options of a cell; {seed} in the checkpoint that it starts from is its seed."""
+    """Options of a cell; {seed} in its start checkpoint is its seed."""
     start = options.get("from")
     foreign = Trainer(**{name: value for name, value in options.items() if name in TRAINER})
     rest = {name: value for name, value in options.items() if name not in {"from", *TRAINER}}

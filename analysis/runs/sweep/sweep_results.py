@@ -1,6 +1,6 @@
 """Results of the cells of a sweep: a row a cell, and mean and standard deviation over the seeds.
 
-OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or "to do"); of what has been trained: psnr (dB),
+OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or "to do"); once it is trained: psnr (dB),
                   ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads (that
                   its steps might use; none where a resume changed them), peak_memory (bytes of the process); wall_ratio,
                   cpu_ratio: over the seconds of the first method, of the same scene and seed, the wall's only at the same
@@ -25,7 +25,7 @@ from analysis.records.findings import attribute_name, of_budgets
 from analysis.records.quantities import PLACES, PLUS_MINUS, SCORES, quantity
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import ViewScores, read_scores
-from analysis.records.schema import INDICES, Effect, Index
+from analysis.records.schema import INDICES, Index
 from analysis.runs.sweep.sweep_file import Cell, Sweep
 from splat.training.checkpoint import write_atomically
 
@@ -128,7 +128,7 @@ def probe_of(run: Path) -> dict[str, float | str | None]:
     return row | {f"{SPLIT}{effect.index}": _bounded(effect) for effect in whole}
 
 
-def _bounded(index: Index | Effect) -> float | None:
+def _bounded(index: Index) -> float | None:
     """The value that a mean may be taken of: none where the number may be without bound."""
     return None if index.low is None or index.high is None else index.value
 

@@ -63,7 +63,7 @@ class ProductErrors(ShortRepr):
 
     @property
     def total(self) -> Float64[Tensor, " k"]:
-        """2 sqrt(step^2 + noise^2): two of what one pair of products shows.  On splats 9 of 10 errors or more are within it."""
+        """2 sqrt(step^2 + noise^2): twice the error that two products show.  On splats it holds 9 of 10 errors or more."""
         return 2 * torch.hypot(self.step, self.noise)
 
 

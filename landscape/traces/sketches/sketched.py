@@ -149,7 +149,7 @@ def most_test_vectors(operator: SymmetricOperator, settings: TraceSettings) -> i
 
 
 def added_directions(Q: Float[Tensor, "n r"], Y: Float[Tensor, "n s"]) -> Float[Tensor, "n a"]:
-    """An orthonormal basis of what Y adds to the span of Q, without directions that are only round-off."""
+    """An orthonormal basis of the directions that Y adds to the span of Q, without round-off."""
     rest = Y.clone(memory_format=torch.contiguous_format)
     for _ in range(2):
         rest -= Q @ (Q.T @ rest)

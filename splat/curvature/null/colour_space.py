@@ -104,7 +104,7 @@ def _colours_of(
 ) -> ColourSpace:
     """The spaces of some Gaussians.  rows: harmonics, and which channels are not clamped; sizes: see `spanned`.
 
-    Harmonic spaces: of channel 0 of every Gaussian, then of channels 1 and 2 of those where other views clamp them.
+    Harmonic spaces: one for channel 0 of every Gaussian; others for channels 1 and 2 only where other views clamp those.
     """
     (harmonics, visible), n = rows.split([rows.shape[2] - 3, 3], dim=2), len(rows)
     everyone = torch.arange(n, device=rows.device)

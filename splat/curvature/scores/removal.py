@@ -103,7 +103,7 @@ def removal_errors(
 
 
 def floored_log_det(matrices: Float64[Tensor, "n d d"], eps: float) -> Float64[Tensor, " n"]:
-    """ln det of positive semi-definite matrices; -inf of those that are 0."""
+    """ln det of positive semi-definite matrices; -inf where they are 0."""
     return _log_sum(eigenvalues(matrices), eps)
 
 

@@ -83,7 +83,7 @@ def block_shares(
             operator = ViewSum(objective, gauss_newton=gauss_newton, ssim_window=couples)
             found.append(_share(operator, blocks.across(active.quats), Z))
             if progress:
-                progress(len(found), 2 * len(couplings), "operators of which the blocks' share is taken")
+                progress(len(found), 2 * len(couplings), "shares of operators within blocks")
     return found
 
 

@@ -45,7 +45,7 @@ class Number:
         return None if tangent is None else self._emit("__mul__", tangent, factor)
 
     def _plus(self, x: Any, y: Any) -> Any:
-        """The sum of two tangents, either of which may be None."""
+        """The sum of two tangents; either may be None."""
         return y if x is None else x if y is None else self._emit("__add__", x, y)
 
     def __neg__(self) -> "Number":

@@ -1,7 +1,7 @@
 """Tile lists on the GPU: which splats touch which tiles of an image, in order of depth.
 
-The same ellipses as on the CPU (`binning.py`, whose formulas are compiled here for Triton), in even steps, none of which gives
-a thread more work for a larger splat:
+The same ellipses as on the CPU (`binning.py`, whose formulas are compiled here for Triton), in even steps: no
+thread has more work for a larger splat:
 
     strips     of every splat, the columns of tiles of its box: a count, a prefix sum, one item a strip
     intersections    of every strip, its rows of tiles inside the ellipse: a count, a prefix sum, one item an intersection

@@ -4,7 +4,7 @@ Every thread holds one splat, in double precision.  A splat's numbers for the ke
 which a pixel near by is kept, and the whitened offset from it: an offset between pixels is a whole number, exact in single
 precision, so the kernels need no double precision to tell what is left of a needle's v.
 
-    X, Y    the pixel nearest to the mean          U, V    the whitened offset of that pixel from the mean
+    X, Y    the pixel nearest to the mean          U, V    the whitened offset from the mean to it
     CAP     alpha above which derivatives in ln alpha are 0: infinite where the splat cannot reach it
 """
 

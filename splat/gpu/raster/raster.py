@@ -7,7 +7,7 @@ added in a fixed order, so every result is the same to the last bit from run to 
 their splats in whatever order, which is faster and takes less memory.
 
 Two sizes are read back by the constructor, the numbers of strips and of intersections (`binning.py`), for which arrays are
-made; no later call waits for the device: there is room for the sums of all intersections, also of those that no pixel reaches.
+made; no later call waits for the device: there is room for the sums of all intersections, even where no pixel reaches them.
 Everything runs on the current stream of the splats' device.
 """
 

@@ -120,7 +120,7 @@ def read_spz(content: bytes) -> SplatFile:
 
 
 def _inflated(content: bytes, size: int) -> bytes:
-    """The first bytes of what was compressed, at most so many."""
+    """The first bytes before compression, at most so many."""
     try:
         return zlib.decompressobj(31).decompress(content, size)
     except zlib.error as error:

@@ -119,8 +119,8 @@ def splat_ply(
 ) -> bytes:
     """A file with graphdeco's properties in graphdeco's order, float32, and then those of `extra`, (n,) each by name.
 
-    Gaussians with a 3-D filter get Mip-Splatting's property for it too.  tool, antialiased: for the comments, of which the
-    second is Postshot's.
+    Gaussians with a 3-D filter get Mip-Splatting's property for it too.  tool, antialiased: for the comments, the second in
+    Postshot's words.
 
     InputError where a further property has the name of one of the Gaussians', or another length.
     """

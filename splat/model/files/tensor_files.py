@@ -34,7 +34,7 @@ RANK = re.compile(r"(.*_rank)(\d+)(\.pt)")
 OWN = b"splat-landscape checkpoint"
 WRAPPED = r"(?:(?:module|_orig_mod)\.)*"
 NERFSTUDIO = re.compile(rf"({WRAPPED}_model\.{WRAPPED}(?:gauss_params\.)?)means")
-MOVED = re.compile(r"camera_opt|bil_grid|appearance|exposure")  # in names of what splatfacto fits beside Gaussians
+MOVED = re.compile(r"camera_opt|bil_grid|appearance|exposure")  # in names of further parameters that splatfacto fits
 FORBIDDEN = re.compile(r"GLOBAL ([\w.]+)|class(?:es)? ([\w.]+)")  # in torch's words on a pickle with other objects
 NUMPY_TYPES = ("Float64DType", "Float32DType", "Int64DType", "Int32DType", "BoolDType")
 

@@ -150,7 +150,7 @@ def _reconstruction(model: Path) -> pycolmap.Reconstruction:
 
 
 def _lines_of_images(path: Path) -> list[tuple[list[str], str]]:
-    """Of each image in images.txt its words, the name as the last, and the line of what it sees, which may be missing."""
+    """Each image in images.txt: its words, the name as the last, and the line of its observations, which may be missing."""
     lines, found = iter(_text(path).splitlines()), []
     for line in lines:
         if not line.strip() or line.startswith("#"):

@@ -54,7 +54,7 @@ USED = {  # the two applied_ ones by `splat/training/origin/frames.py`
     *NUMBERS, *SPLIT, "frames", "file_path", "transform_matrix", "mask_path", "ply_file_path", "background", "camera_model",
     "is_fisheye", "applied_transform", "applied_scale",
 }  # fmt: skip
-NO_MATTER = {"rotation", "sharpness", "colmap_im_id"}  # steps and marks of those who made the file
+NO_MATTER = {"rotation", "sharpness", "colmap_im_id"}  # steps and marks of whoever made the file
 
 
 def read_blender(root: Path, strict: bool = False) -> tuple[list[Photo], list[str]]:
@@ -125,7 +125,7 @@ def _subsets(data: Mapping[str, Any], path: Path) -> dict[str, Subset]:
 def _load(path: Path) -> dict[str, Any]:
     require_content(path)
     try:
-        data = loose_json(path.read_text(encoding="utf-8-sig"), parse_int=float)  # of which the largest is infinite
+        data = loose_json(path.read_text(encoding="utf-8-sig"), parse_int=float)  # the largest become infinite
     except (ValueError, OSError, RecursionError) as error:
         raise InputError(f"expected a JSON file with frames, cannot read {path}: {error}") from error
     frames = data.get("frames") if isinstance(data, dict) else None

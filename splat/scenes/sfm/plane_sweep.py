@@ -1,4 +1,4 @@
-"""Dense points from some views with known poses, by a plane sweep: a point for most of what two of them show.
+"""Dense points from some views with known poses, by a plane sweep: a point for most surfaces that two of them show.
 
     planes      parallel to the image of a reference view, evenly spaced in 1 / z from near to BEYOND near, so closely that
                 in any other view a pixel moves by at most one between neighbours
@@ -49,7 +49,7 @@ class DepthMap:
 
 
 def dense_points(views: Sequence[View], near: Sequence[float]) -> Points:
-    """The points that at least two of these views agree on.  near: the least z of what each view shows.
+    """The points that at least two of these views agree on.  near: the least z in each view.
 
     InputError where there are fewer than two views, or nothing that they agree on.
     """

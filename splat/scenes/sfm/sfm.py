@@ -38,8 +38,8 @@ CAMERA = "SIMPLE_RADIAL"
 class Mapped:
     """The result of structure from motion.
 
-    placed: photographs in the kept model.  left_out: names of the others.  models: numbers of photographs of the kept model
-    and of those with photographs that it lacks.  points: in the kept model.  error: mean reprojection error, px.
+    placed: photographs in the kept model.  left_out: names of the others.  models: numbers of photographs in the kept model,
+    and in each other one with photographs that it lacks.  points: in the kept model.  error: mean reprojection error, px.
     """
 
     placed: int

@@ -118,7 +118,7 @@ def in_short(changed: list[str]) -> str:
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """See the module.  question: leaves, of which those of the loss itself begin with "objective."."""
+    """See the module.  question: leaves; those about the loss itself begin with "objective."."""
 
     data: dict[str, ViewData]
     question: dict[str, Any]

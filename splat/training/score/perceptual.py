@@ -1,6 +1,6 @@
 """LPIPS (Zhang et al. 2018): the distance of two images in the features of a network.  Lower is better.
 
-The package `lpips` (the extra of that name) computes it with VGG-16, whose weights torchvision fetches when they are first
+The package `lpips` (the extra `lpips`) computes it with VGG-16, whose weights torchvision fetches when they are first
 used.  Images go in as they are, in [0, 1], because 3DGS's `metrics.py` and its sparse-view followers feed them so: the
 network was meant to see [-1, 1], but then no number would compare with theirs.
 """

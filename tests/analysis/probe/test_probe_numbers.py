@@ -139,7 +139,7 @@ def test_positions_are_split_along_and_across_the_rays(record, dense):
     assert found.gradient_ratio == pytest.approx(split.gradient_ratio, rel=1e-6)
     assert found.gradient_median == pytest.approx(split.median_ratio, rel=1e-6)
     assert found.pairs == len(split.components) <= len(objective.active) * len(objective.views)
-    depth, lateral = found.curvature.depth, found.curvature.lateral
+    depth, lateral = found.curvature["depth"], found.curvature["lateral"]
     whole = record.data.traces["means"]
     error = math.hypot(*(trace.standard_error for trace in (depth, lateral, whole)))
     assert abs(depth.value + lateral.value - whole.value) < 5 * error

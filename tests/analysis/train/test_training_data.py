@@ -104,7 +104,7 @@ def test_frames_without_an_image_and_a_poor_start_are_said(original, tmp_path, c
     assert "1 of 5 frames that the scene lists were skipped" in said and "images/view_001.png" in said
     assert "points only, and may leave places empty; --start dense finds more" in said
     assert train(scene, tmp_path / "random", "--start", "random") == 0
-    assert "random points, of which most lie on no surface" in capsys.readouterr().err
+    assert "random points, and most lie on no surface" in capsys.readouterr().err
     sources: tuple[Source, ...] = get_args(Source)
     assert all(poor_start(load_scene(scene), source, 2) for source in sources)
     assert set(HOW_IT_STARTS) == set(HOW_TO_START) == set(sources) - {"scene"}

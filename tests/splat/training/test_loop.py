@@ -297,7 +297,7 @@ def test_gaussians_nearer_than_the_near_plane_are_refused_before_a_step():
     gaussians.means.mul_(1e-3)
     small = [replace(view, camera=replace(view.camera, centre=view.camera.centre * 1e-3)) for view in views]
     training = Training.start(gaussians, EXTENT, tiny_config(16))
-    refused(r"got 12, of which none of 3 views .* up to [1-9]\d* lie nearer", prepare, training, small)
+    refused(r"got 12 that none of 3 views draws; up to [1-9]\d* lie nearer", prepare, training, small)
     gaussians.means.fill_(1e6)  # neither near nor in an image
     with pytest.raises(InputError, match=r"up to 0 lie nearer than the near plane at 0\.2"):
         prepare(Training.start(gaussians, EXTENT, tiny_config(16)), small)

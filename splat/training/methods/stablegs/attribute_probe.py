@@ -16,7 +16,7 @@
     sh      + w_l e, e ~ N(0, 1) for each coefficient and channel, w_l = rho (1 + l / l_max), rho if l_max = 0 Eq. (13)
 
 Quaternions are w x y z; x is the Hamilton product, exp(omega) = (cos(|omega| / 2), sin(|omega| / 2) omega / |omega|).  kappa is
-the condition number of the splat's covariance in the sampled view, with its blur.  A Gaussian out of that view has g = 0 and no
+the condition number of the splat's covariance in the sampled view, with its blur.  A Gaussian outside the view has g = 0 and no
 kappa: its mean, quaternion and opacity stay.  Scales and SH of all Gaussians are probed, as in Eqs. (11) and (13), for renders
 of the probed copy from other poses.
 
