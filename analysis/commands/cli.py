@@ -191,7 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parsed(arguments: Sequence[str]) -> tuple[Command, Any]:
-    """A command and its options, which are parsed alone: what an error advises is of that command.
+    """A command and its options, which are parsed alone: an error advises about this command.
 
     SystemExit for help, and where they cannot be parsed; InputError for a command that there is not.
     """

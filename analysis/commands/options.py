@@ -43,7 +43,7 @@ class MapOptions:
 
     checkpoint: CheckpointPath
     shown: Annotated[str, arg(name="field")] = "largest"
-    """The number that pictures, colours and the top of the table are of; any of those in fields.ply.
+    """The number that pictures, colours and the top of the table show; any in fields.ply.
     Where RUN/probe holds eigenvectors, also e1 and e_min: the Gaussians' shares of them."""
     draw: UseAppendAction[tuple[str, ...]] = ()
     """A training view to draw, by name or by place (0 is the first); may be given again.  Default: all of them."""

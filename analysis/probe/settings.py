@@ -18,7 +18,7 @@ class ProbeSettings:
     checked_vectors, checked_views: of the self-checks; None: all views.
     trace_samples: exactly so many for each trace; None: as many as `traces` asks for.
     power: iterates of power iteration; power_apart: with products of its own.  density_matvecs: products of the spectral
-        density, of which a tenth sees the ends again; 0: it is left out.
+        density (a tenth of them see the ends again); 0: it is left out.
     slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
         of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
         slice_plane: whether to render more than its two axes.

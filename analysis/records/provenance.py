@@ -152,16 +152,8 @@ def versions() -> dict[str, str | None]:
 
 def commit() -> str | None:
     """Commit of the checkout with this code; see `Provenance`."""
-    command = [
-        "git",
-        "-C",
-        str(Path(__file__).parent),
-        "describe",
-        "--always",
-        "--abbrev=12",
-        "--exclude=*",
-        "--dirty=+",
-    ]
+    words = "describe --always --abbrev=12 --exclude=* --dirty=+"
+    command = ["git", "-C", str(Path(__file__).parent), *words.split()]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=5).stdout.strip()
     except (OSError, subprocess.SubprocessError):

@@ -34,21 +34,11 @@ Row = tuple[str, str, str]
 
 def probe_table(data: ProbeRecord, width: int = 80) -> Table:
     """Traces, eigenvalues, anisotropy, counts and checks.  Words are wrapped to the width, numbers are not."""
-    rows = [
-        *_trace_rows(data),
-        None,
-        *_end_rows(data),
-        None,
-        *_index_rows(data),
-        None,
-        *_depth_rows(data.depth),
-        None,
-        *_share_rows(data.block_shares or []),
-        None,
-        *_count_rows(data.counts),
-        None,
-        *_check_rows(data.checks),
-    ]
+    sections = (
+        _trace_rows(data), _end_rows(data), _index_rows(data), _depth_rows(data.depth), _share_rows(data.block_shares or []),
+        _count_rows(data.counts), _check_rows(data.checks),
+    )  # fmt: skip
+    rows = [row for section in sections for row in (*section, None)][:-1]
     rows = [row and (row[0], _folded(row[1], NUMBER), row[2]) for row in rows]
     name, value = (max(len(line) for row in rows if row for line in row[i].splitlines()) for i in (0, 1))
     name = min(name, max(width - value - GAPS - REMARK, REMARK))

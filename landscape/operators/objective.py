@@ -158,19 +158,11 @@ class ObjectiveHessian:
             return torch.zeros_like(V)
         columns, leaves = [], list(self._point.values())
         for v in V.unbind(dim=1):
-            vectors = self._split(v)
+            parts = self._split(v)
+            vectors = [parts[name] for name in names]
             with _in_a_sentence(REMEDIES_TWICE):
-                columns.append(
-                    self._flat(
-                        torch.autograd.grad(
-                            outputs,
-                            leaves,
-                            [vectors[name] for name in names],
-                            retain_graph=True,
-                            materialize_grads=True,
-                        )
-                    )
-                )
+                found = torch.autograd.grad(outputs, leaves, vectors, retain_graph=True, materialize_grads=True)
+            columns.append(self._flat(found))
         return torch.stack(columns, dim=1)
 
     def _split(self, flat: Float[Tensor, " n"]) -> dict[str, Tensor]:

@@ -381,10 +381,7 @@ def test_damaged_trajectories_are_refused_by_file_and_column(tmp_path):
         (lambda t: t.drop(columns="trace_sh_low"), "got no column trace_sh_low"),
         (lambda t: t.assign(lambda_max="steep"), "expected a number as lambda_max in .*, got 'steep' in row 1"),
         (lambda t: t.assign(step=None), "expected a number as step in"),
-        (
-            lambda t: t.assign(state="lost"),
-            "expected whole or coarse or cut or skipped as state in .*, got 'lost' in row 1",
-        ),
+        (lambda t: t.assign(state="lost"), "expected whole or coarse or skipped as state in .*, got 'lost' in row 1"),
         (lambda t: t.head(0)[[]], "got No columns"),
     ):
         change(rows()).to_csv(path, index=False)
