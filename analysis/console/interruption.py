@@ -69,8 +69,8 @@ def look() -> None:
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Signals end the process in the block, in which libraries are loaded: their C drops what Python raises, and pycolmap
-    takes SIGTERM for itself."""
+    """Load libraries in the block: there a signal ends the process, as their C code drops Python's exceptions, and pycolmap
+    handles SIGTERM itself."""
     before = _handle(dict.fromkeys(SIGNALS, signal.SIG_DFL)) if current_thread() is main_thread() else {}
     try:
         yield

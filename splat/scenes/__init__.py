@@ -1,6 +1,6 @@
 """Scenes, and pycolmap, which is imported here for all.
 
-It brings a zlib of its own.  Where that is loaded before Python's, the next PNG ends the process.
+pycolmap bundles its own zlib.  If it loads before Python's, the next PNG crashes.
 """
 
 import zlib  # noqa: F401

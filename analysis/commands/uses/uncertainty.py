@@ -5,9 +5,9 @@
     view-NNN.npz, .png  photograph, |error|, and the standard deviations by both
     uncertainty.json    where it comes from
 
-AUSE: the mean |error| of the pixels that are left when those of the largest variance are taken away, over that of all, less the
-same where those of the largest error are taken, averaged over the shares taken; 0 at best.  `ause_random` is that of an order
-that knows nothing.
+A sparsification curve is the mean |error| of the pixels that are left when a share of them is taken away, over the mean of all.
+AUSE is the area between the curve that takes the largest variances first and the one that takes the largest errors first; 0 at
+best.  `ause_random`: the same for pixels taken at random.
 """
 
 from collections.abc import Sequence

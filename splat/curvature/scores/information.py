@@ -9,10 +9,9 @@ over the views seen so far and a prior, and C that of a candidate, by Gaussian:
     t           tr B^-1 C
     e           ln of how much the least eigenvalue of B grows, in units of the prior, summed
     d_diagonal  d of the diagonals alone
-    published   FisherRF's score (Jiang et al. 2024), sum over parameters but rotations, which its code leaves out, of
-                c / (b + 1e-6) for the diagonals of the squared *sum over the channels* of the derivatives, in which opposite
-                channels cancel: here that of Gaussians whose red is the sum of their channels, which is the same but where
-                one is clamped at 0
+    published   FisherRF's score (Jiang et al. 2024): sum of c / (b + 1e-6) over all parameters but rotations, as its code does.
+                Its b and c are squares of the derivatives' *sum over the channels*, where opposite channels cancel.  Here they
+                are those of Gaussians whose red is the sum of their channels: the same unless a channel is clamped at 0
 
 Prior: precisions that are PRIOR times the mean of the training views' diagonals, one for each attribute.  It stands for what
 is known without any view, and decides what a Gaussian that none has seen yet is worth.
