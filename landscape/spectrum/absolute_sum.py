@@ -62,14 +62,17 @@ def absolute_integral(nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m
     """
     if not len(nodes):
         return 0.0, 0.0, 0.0
+    # a rule that is the measure itself has no bounds to either side
     kept, scale = weights > 0, float(nodes.abs().max())
     gauss = float((weights * nodes.abs()).sum())
     if scale == 0 or int(kept.sum()) == 1 or not kept.all():
         return gauss, gauss, gauss
+    # back from nodes and weights to the tridiagonal T of the rule
     (rule,) = lanczos(DenseOperator(torch.diag(nodes / scale)), weights.sqrt()[:, None], len(nodes))
     T, size = rule.T, scale * float(weights.sum())
     if len(T) == 1:  # all nodes are the same to round-off
         return gauss, gauss, gauss
+    # T(a) that is singular has a node at 0: the lower bound
     least, unit = _singular_end(T), float(T[-1, -2].abs())
     centre = least if abs(least) < FAR else float(T[-1, -1])
 
@@ -77,6 +80,7 @@ def absolute_integral(nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m
         """Integrals by T(a), a = centre + unit sinh(step)."""
         return size * _absolute_integrals(T, centre + unit * torch.sinh(steps))
 
+    # the upper bound: the largest integral over a, by a grid that closes in
     steps = torch.linspace(-REACH, REACH, 2 * RESOLUTION + 1, dtype=torch.float64)
     for _ in range(ROUNDS):  # the maximum lies between the neighbours of the best point of the grid
         found = integrals(steps)

@@ -117,16 +117,21 @@ class SpectralDensity:
         values: of the summed function, at the nodes.  other: an independent error of the mean, at the same confidence.
         """
         shares, count = self.weights / len(self.weights), len(samples)
+        # d: deviations of f from its mean at the nodes, in units of the largest
         d = torch.where(shares > EPS * EPS, values - (shares * values).sum(), 0.0)  # others are round-off
         unit = float(d.abs().max()) if self.rest and d.numel() else 0.0  # no power leaves the range of floats
         if unit <= ROUND_OFFS * EPS * float((shares * values).abs().sum()):  # all the same: d is the mean's round-off
             return other, other
+        # moments of f over the unknown eigenvalues, as the rules know them: p_2, p_3, p_4 a direction
         second, third, fourth = (float((shares * (d / unit) ** power).sum()) for power in (2, 3, 4))
         skewness = third / second
+        # degrees of freedom of p_2, for the quantile
         freedom = self.rest * count / (fourth / second / second - skewness * skewness / second)
         q = t_quantile(max(freedom, 2.0 * count), 1 - (1 - RESERVED) * (1 - confidence))
+        # the interval of the Cornish-Fisher expansion, solved for T (see the module)
         b, variance = skewness / count, 2 * self.rest * second / count
         seen = 1.0
+        # signs see less: the share of the variance that the samples themselves show, at most
         if count > 1:
             own = (float(standard_deviation(samples)) / unit) ** 2 / count
             seen = min(own / variance * (count - 1) / float(chdtri(count - 1, confidence)), 1.0)

@@ -260,8 +260,10 @@ def project_adjoint(
     ahead = here & (tl.load(drawn + i, here, other=0) != 0)
     camera = numbers(lens, LENS)
     mean, log_scales, quat = geometry_at(flat, i, n, here)
+    # the adjoints of colours, and of the harmonics' weights
     colour_bar, _visible = colour_bars(bar, splats, i, here)
     weight = harmonic_weights(flat, colour_bar, i, n, BANDS, here)
+    # the adjoint of mean, conic and, where antialiased, of the opacity's factor
     opacity = tl.load(splats + i * 9 + 5, here, other=0.0)
     logit_slope = 1.0 - opacity
     splat_bar = row(bar, i, 9, 5, here)
@@ -270,11 +272,14 @@ def project_adjoint(
         logit_slope = sigmoid(-logit)
         splat_bar = splat_bar + (sigmoid(logit) * tl.load(bar + i * 9 + 5, here, other=0.0),)
     width = row(widths, i, 1, 1, here)[0]
+    # pulled back to mean, log-scales and quaternion
     pulled = adjoint_of(camera, mean, log_scales, quat, width, ANTIALIASED, splat_bar, weight, BANDS)
     for j in tl.static_range(10):
         tl.store(gradient + place_of(j, i, n), tl.where(ahead, pulled[j], 0.0), here)
+    # the logit
     logit_bar = opacity * logit_slope * tl.load(bar + i * 9 + 5, here, other=0.0)
     tl.store(gradient + start_of(3, n) + i, tl.where(ahead, logit_bar, 0.0), here)
+    # SH
     _found, harmonic = splat_of(camera, mean, log_scales, quat, width, False)
     for b in tl.static_range(BANDS):
         for c in tl.static_range(3):
@@ -298,10 +303,12 @@ def linearize_geometry(
     splat, adjoint = row(splats, i, 9, 6, here), row(moments, i, 9, 6, here)
     S = tl.load(moments + i * 9, here, other=0.0).to(tl.float64)
     logit, width = tl.load(flat + start_of(3, n) + i, here, other=0.0).to(tl.float64), row(widths, i, 1, 1, here)[0]
+    # a row of P' and of (a . P'') in each lane
     found = linearized_geometry(
         camera, mean, log_scales, quat, sigmoid(logit), width, ANTIALIASED, splat, adjoint, lane
     )
     rows, bends = found[0], found[1]
+    # the opacity: its slope in the logit and, antialiased, its factor's in the geometry
     if ANTIALIASED:
         slope = sigmoid(-logit)
         tl.store(opacity_slope + lane * m + e, found[2], here & (lane < 10))
@@ -310,6 +317,7 @@ def linearize_geometry(
         slope = 1.0 - tl.load(splats + i * 9 + 5, here, other=0.0)
     tl.store(logit_slope + e, slope, here & (lane == 0))
     tl.store(logit_curvature + e, slope * (2.0 * slope - 1.0) * S, here & (lane == 0))
+    # P' whole, of (a . P'') the lower triangle
     for r in tl.static_range(5):
         tl.store(jacobian + (r * 10 + lane) * m + e, rows[r], here & (lane < 10))
     for j in tl.static_range(10):
@@ -369,16 +377,19 @@ def push_forward(
     u = tangents_at(block, i, k, K, n, here)
     at = out + (i * K + k) * 9
     logit = tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
+    # ln opacity
     change = tl.load(logit_slope + e, kept, other=0.0) * logit
     if ANTIALIASED:
         for j in tl.static_range(10):
             change += tl.load(opacity_slope + j * m + e, kept, other=0.0) * u[j]
     tl.store(at, change, here)
+    # the five whitened coefficients of mean and conic
     for r in tl.static_range(5):
         total = u[0] * 0.0
         for j in tl.static_range(10):
             total += tl.load(jacobian + (r * 10 + j) * m + e, kept, other=0.0) * u[j]
         tl.store(at + 1 + r, total, here)
+    # colours: by the direction to the mean, and by SH
     for c in tl.static_range(3):
         total = u[0] * 0.0
         for j in tl.static_range(3):
@@ -400,12 +411,14 @@ def pull_back(
     k += tl.program_id(1) * VECTORS
     kept, here = e < m, (e < m) & (k < K)
     i = tl.load(index + e, kept, other=0)
+    # y: the cotangents of the splat's nine numbers, those of clamped colours 0
     bars = ()
     for j in tl.static_range(9):
         bars = bars + (tl.load(cotangents + (i * K + k) * 9 + j, here, other=0.0),)
     colour = ()
     for c in tl.static_range(3):
         colour = colour + (tl.load(visible + c * m + e, kept, other=0.0) * bars[6 + c],)
+    # P'^T y in the geometry: by mean and conic, by the colours' direction, by the opacity's factor
     h = ()
     for j in tl.static_range(10):
         total = tl.load(jacobian + j * m + e, kept, other=0.0) * bars[1]
@@ -417,13 +430,16 @@ def pull_back(
         if ANTIALIASED:
             total += tl.load(opacity_slope + j * m + e, kept, other=0.0) * bars[0]
         h = h + (total,)
+    # and in the logit
     logit_bar = tl.load(logit_slope + e, kept, other=0.0) * bars[0]
     u = tangents_at(block, i, k, K, n, here)
     if SECOND_ORDER:
+        # (a . P'') u of the geometry, and of the logit
         h = curved(columns(curvature, e, m, 55, kept), u, h)
         logit = tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
         logit_bar += tl.load(logit_curvature + e, kept, other=0.0) * logit
         if ANTIALIASED:
+            # the opacity's factor mixes both
             bent = ()
             for j in tl.static_range(10):
                 across = tl.load(opacity_curvature + j * m + e, kept, other=0.0)
@@ -431,6 +447,7 @@ def pull_back(
                 logit_bar += across * u[j]
             h = bent
     mean = (h[0], h[1], h[2])
+    # SH: P'^T y, and the mixed second derivatives of SH and mean both ways
     for b in range(BANDS):
         at = (start_of(4, n) + (i * BANDS + b) * 3) * K + k
         s = columns(slope + b * 3 * m, e, m, 3, kept)

@@ -77,6 +77,7 @@ def hutch_plus_plus(
     """
     if operator.dim <= settings.max_probes:
         return by_identity(operator, settings, name, generator.device)
+    # a third of the products: the range of H, as far as random vectors show it
     sketch = draw_probes(operator.dim, settings.max_probes // 3, generator, operator.dtype, settings.distribution)
     start, Y = monotonic(), sketch[:, :0]
     for vectors in sketch.split(settings.batch, dim=1):
@@ -84,7 +85,9 @@ def hutch_plus_plus(
         if monotonic() - start > (deadline - start) / 3:
             break
     Q, rank = torch.linalg.qr(Y).Q, Y.shape[1]
+    # a second third: the trace within that range, exactly
     known = float((Q.double() * products(operator, Q, settings.batch).double()).sum())
+    # the last third: the trace of the rest, by probes
     rest = ProjectedOperator(operator, lambda V: V - Q @ (Q.T @ V))
     most = settings.max_probes - 2 * rank
     probing = replace(settings, min_probes=min(settings.min_probes, most), max_probes=most, method="hutchinson")
@@ -125,18 +128,22 @@ def xtrace(
             Z = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, kind)
             start = Z, products(operator, Z, settings.batch)
         (Z, HZ), start = start, None
+        # the sketch grows by the part of the new products that it does not span yet, and by products with that
         Omega, Y = torch.cat([Omega, Z], dim=1), torch.cat([Y, HZ], dim=1)
         new = added_directions(Q, HZ)
         Q, HQ = torch.cat([Q, new], dim=1), torch.cat([HQ, products(operator, new, settings.batch)], dim=1)
+        # each test vector judges the sketch of the others
         samples, without = _leave_out(Omega, Y, Q, HQ, kind == "gaussian")
         value, error, spent = float(samples.mean()), _error(samples, without), count + Q.shape[1]
         half = t_quantile(count - 1, settings.confidence) * error
+        # stop at the tolerance, at a budget, or once the sketch spans the range of H
         late, reached = monotonic() > deadline, settings.reached(value, value - half, value + half)
         complete = Q.shape[1] < count  # Q spans the range of H: its trace is that of Q^T H Q
         if late or (reached and complete) or rule.end(count, reached):
             reason: StopReason = "tolerance" if reached else "time budget" if late else "matvec budget"
             interval = value, error, value - half, value + half, settings.confidence
             return TraceEstimate(name, n, *interval, count, spent, reason, samples, "xtrace")
+        # go on with more test vectors, or with the identity where that costs no more
         count = rule.next
         if spent + n <= 2 * count:
             return by_identity(operator, settings, name, generator.device, spent)
@@ -178,22 +185,29 @@ def _leave_out(
     products of small matrices.
     """
     (n, count), rank = Omega.shape, Q.shape[1]
+    # all that is large enters by these small products: R = Q^T Y, W = Q^T Omega, core = Q^T H Q, T = Q^T H Omega
     R, W, core, T = gram(Q, Y), gram(Q, Omega), gram(Q, HQ), gram(HQ, Omega)
     found = left_out_directions(R)
+    # s_i: what the sketch loses without test vector i (nothing where the others span all of Q)
     S, less = (R.new_zeros(rank, count), 0) if found is None else (found, 1)  # less: dimensions that a test vector adds
+    # of every pair of s_i and s_j, or of s_i and u of the whole sketch: angles, projections of Omega, slopes and curvatures
     angles, b, pull, inner = S.T @ S, S.T @ W, S.T @ (T - core @ W), S.T @ core @ S
+    # |u|^2 and u . H u with the whole sketch, u = (1 - Q Q^T) omega
     squares = column_dots(Omega, Omega) - W.square().sum(dim=0)
     products = column_dots(Omega, Y) - 2 * (W * T).sum(dim=0) + (W * (core @ W)).sum(dim=0)
     inner_jj, b_jj, pull_jj = inner.diagonal(), b.diagonal(), pull.diagonal()
+    # t_j, without s_j: u gains b_jj s_j, which changes |u|^2, u . H u, and the trace within the sketch
     quadratic = products + 2 * b_jj * pull_jj + b_jj.square() * inner_jj
     length = (n - rank + less) / (squares + b_jj.square()) if spherical else 1.0
     t = core.trace() - inner_jj + length * quadratic
     # t_j^i, i in rows and j in columns: P = {i, j}, a 2 x 2 system for y = (y_i, y_j)
     det = (1 - angles.square()).fill_diagonal_(1)
     y_i, y_j = (b - angles * b_jj) / det, (b_jj - angles * b) / det
+    # |u|^2 and u . H u gain the parts along s_i and s_j
     squares = squares + b * y_i + b_jj * y_j
     quadratic = products + 2 * (y_i * pull + y_j * pull_jj)
     quadratic = quadratic + y_i.square() * inner_jj[:, None] + 2 * y_i * y_j * inner + y_j.square() * inner_jj
+    # the trace within the sketch loses that of the plane of s_i and s_j
     trace = core.trace() - (inner_jj[:, None] + inner_jj - 2 * angles * inner) / det
     length = (n - rank + 2 * less) / squares if spherical else 1.0
     return t.cpu(), (trace + length * quadratic).cpu()

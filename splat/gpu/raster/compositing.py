@@ -215,6 +215,7 @@ def forward(
     stopped = tl.where(inside, NEVER, 0)
     zero = tl.zeros((1, HEIGHT, WIDTH), real)
     red, green, blue = zero, zero, zero
+    # front to back; the next splat's index is loaded ahead of its use
     following = tl.load(splat_of + first, count > 0, other=0)
     done = 0
     while done < count:
@@ -224,10 +225,12 @@ def forward(
             _u, v, terms = exponent_terms(splat, place)
             alpha, _uncapped = alpha_row(v, terms, T > 0, cap)
             w, after = alpha * T, tl.fma(-alpha, T, T)
+            # a pixel stops in front of the splat that would take T below the floor
             ends = (after < floor) & (T > 0)
             w, T = tl.where(ends, 0.0, w), tl.where(ends, -T, after)
             stopped = tl.where(ends, k, stopped)
             red, green, blue = plus((red, green, blue), w, load3(splat, RED))
+        # until all pixels of the tile have stopped
         running = tl.max(tl.max(tl.max(T, 2), 1), 0)
         done = tl.where(running > 0, done + CHUNK, count)
     T = tl.abs(T)
@@ -251,7 +254,9 @@ def backward(
     first, count = tl.load(start + tile), tl.load(reached + tile)
     T, v_pixel = tl.load(transmittance + p, inside, other=1.0), load_planes(v_planes, p, size, inside)
     stopped = tl.load(stop + p, inside, other=0)
+    # R behind all splats: the background's part of the loss's slope
     R = T * behind_all(v_pixel, load_background(frame, real))
+    # a tile without cotangent adds nothing
     if not any_lit(v_pixel):
         if not ATOMIC:
             clear_sums(accumulators, first, count, sums, 9)
@@ -262,8 +267,10 @@ def backward(
         following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
         splat = packed + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, place)
+        # undo the splat: T and R in front of it
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         T, after, w, beta, _r, we = step_back(alpha, T, R, v_pixel, load3(splat, RED))
+        # s = dL/dq, 0 where the cap holds
         s = tl.where(uncapped <= tl.load(splat + CAP), we - beta * R, 0.0)
         R = after
         at = s_index if ATOMIC else tl.load(accumulators + first + k)
@@ -320,6 +327,7 @@ def tangent(
     T = tl.full((1, HEIGHT, WIDTH), 1.0, real)
     dT = tl.zeros((K, HEIGHT, WIDTH), real)
     red, green, blue = dT, dT, dT
+    # a tile in which no tangent moves a splat stays 0
     some = any_moved(moved, splat_of, first, count, begin, stride, K)
     tl.store(moves + tile, some.to(tl.int32))
     count = tl.where(some, count, 0)
@@ -330,8 +338,10 @@ def tangent(
         splat = packed + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, place)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
+        # primal: w and T
         w = alpha * T
         T = tl.fma(-alpha, T, T)
+        # tangents: q', 0 where the cap holds; then T' and image'
         q, dcolour = tangents_of(tangents, s_index, begin + i, stride)
         w_dq = tl.where(uncapped <= tl.load(splat + CAP), w, 0.0) * quadratic(v, along_row(q, u))
         dT, image = step_tangent(dT, (red, green, blue), alpha, w, w_dq, load3(splat, RED), dcolour)
@@ -362,10 +372,12 @@ def backward_tangent(
     dT = tl.load(transmittances + i * size + p, inside & (i < K), other=0.0)
     dv_pixel = load_planes(dv_planes, i * 4 * size + p, size, inside & (i < K))
     background = load_background(frame, real)
+    # behind all splats: R, R' and tau = T' / T
     behind = behind_all(v_pixel, background)
     R = T * behind
     dR = dT * behind + T * behind_all(dv_pixel, background)
     tau = dT / T
+    # nothing to do where neither a moved splat meets a cotangent nor the cotangent moves
     if not ((any_lit(v_pixel) & (tl.load(moves + tile) != 0)) | any_lit(dv_pixel)):
         if not ATOMIC:
             clear_sums(accumulators, first, count, sums, 9 * K)
@@ -379,6 +391,7 @@ def backward_tangent(
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         free = uncapped <= tl.load(splat + CAP)
         colour = load3(splat, RED)
+        # undo the splat in T and R, then in tau and R'
         T, after, w, beta, r, _we = step_back(alpha, T, R, v_pixel, colour)
         q, dcolour = tangents_of(tangents, s_index, begin + i, stride)
         dq = tl.where(free, quadratic(v, along_row(q, u)), 0.0)
