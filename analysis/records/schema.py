@@ -117,7 +117,7 @@ class TraceOf(Struct, kw_only=True):
 class Trace(TraceOf, kw_only=True):
     """Trace of one attribute's block.  dim: its directions that are not exactly flat; tau: sqrt(max(value, 0) / dim)."""
 
-    tau: Size
+    tau: Number
 
 
 class LivesOn(Struct, kw_only=True):
