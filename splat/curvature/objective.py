@@ -53,20 +53,6 @@ class ActiveCounts:
     radial_quaternions: int
     views: int
 
-    @classmethod
-    def of(cls, gaussians: Gaussians, active: Gaussians, views: int) -> "ActiveCounts":
-        """gaussians: all that are given, with all their SH bands; active: with those in use."""
-        return cls(
-            gaussians=len(gaussians),
-            active_gaussians=len(active),
-            parameters=gaussians.flat.numel(),
-            active_parameters=active.flat.numel() - len(active),
-            sh_degree=gaussians.sh_degree,
-            active_sh_degree=active.sh_degree,
-            radial_quaternions=len(active),
-            views=views,
-        )
-
 
 class SceneObjective:
     """The mean loss L over views as a function of the active Gaussians' stored parameters.
@@ -126,7 +112,9 @@ class SceneObjective:
         self._unseen = 0.0  # share of the inactive ones in R
         if loss_settings.opacity_reg or loss_settings.scale_reg:  # else they need not be copied
             self._unseen = Regularizers(used.select(~self.mask), loss_settings, len(gaussians)).value
-        self.counts = ActiveCounts.of(gaussians, self.active, len(views))
+        n, given, kept = len(self.active), gaussians.flat.numel(), self.active.flat.numel()
+        degrees = gaussians.sh_degree, self.active.sh_degree
+        self.counts = ActiveCounts(len(gaussians), n, given, kept - n, *degrees, n, len(views))
 
     @property
     def couples_pixels(self) -> bool:
