@@ -20,7 +20,7 @@ from analysis.records.run_files import RECORDS, read_trajectory
 from figures.manifold import Scale, landscape_of, require_same_function, section, start_of, surface
 from figures.scripts import runs_script
 from figures.style import BLUE, RUNS, literal, new_figure, style
-from figures.trajectory import index_over_steps, marker_words, step_ticks
+from figures.trajectory import marker_words, over_steps, step_ticks
 from landscape.errors import InputError
 
 PAGE = 6.9  # inches
@@ -43,7 +43,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     with style():
         figure = new_figure(4.4, PAGE)
         index = figure.add_subplot(2, 3, 1)
-        index_over_steps(index, measured, dict(zip(names, RUNS, strict=False)), "eigenvalue_ratio")
+        over_steps(index, measured, dict(zip(names, RUNS, strict=False)), "eigenvalue_ratio")
         index.set(xlabel="step", ylabel="|λmax / λmin|", title="Anisotropy index")
         index.xaxis.set_major_locator(step_ticks())
         index.grid(True)
@@ -99,7 +99,7 @@ def _measured(run: Path, name: str) -> pd.DataFrame:
     table = read_trajectory(run / RECORDS)
     table = pd.DataFrame(table[table["state"] != "skipped"]).assign(run=name)
     if table.empty:
-        raise InputError(f"expected records in {run / RECORDS}, all were skipped; train with a larger --probe-share")
+        raise InputError(f"expected records in {run / RECORDS}, all were skipped")
     return table
 
 

@@ -1,9 +1,8 @@
 """Figure: the landscape along one or several trainings, from the table that `landscape trajectory` wrote.
 
-`python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Bands show 95% intervals of the traces, residuals
-of the eigenvalues, and brackets of the indices; a triangle is a lower bound, where no more is known of an index.  An axis is
-logarithmic where all of its values are positive and span more than a decade.  |lambda_max / lambda_min| has hollow markers
-where the quotient is negative.
+`python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Every panel has a logarithmic axis of magnitudes,
+hollow where the number is negative.  Bands show 95% intervals of the traces, residuals of the eigenvalues, and brackets of the
+participation ratio.  The title says what became of the steepest curvature.
 """
 
 import math
@@ -19,17 +18,24 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from analysis.console.failures import program
-from analysis.records.findings import ATTRIBUTES, attribute_name
-from analysis.records.quantities import exponent_of, power_of_ten, unit_suffix
+from analysis.records.quantities import power_of_ten, rough
 from analysis.records.run_files import ENDS, read_trajectory
 from figures.scripts import table_script
 from figures.style import BLACK, RUNS, literal, new_figure, style
 from landscape.errors import InputError
 
-INDICES = {"eigenvalue_ratio": "|λmax / λmin|", "participation_ratio": "participation ratio"}
+PANELS = {
+    "lambda_max": ENDS["lambda_max"],
+    "lambda_min": ENDS["lambda_min"],
+    "trace_quats": "trace of rotation",
+    "trace_means": "trace of position",
+    "participation_ratio": "participation ratio",
+    "gaussians": "Gaussians",
+}
 UNITS = "traces, eigenvalues: loss per squared stored unit"
 PANEL = 1.12  # inches of height
 LEGEND_LINE = 0.14
+ARROW: dict[str, Any] = {"marker": r"$\uparrow$", "markersize": 7, "linestyle": "none"}  # stands on a lower bound
 
 
 def draw(table: pd.DataFrame) -> Figure:
@@ -37,38 +43,46 @@ def draw(table: pd.DataFrame) -> Figure:
 
     Raises InputError where nothing was measured.
     """
-    measured = pd.DataFrame(table[table["state"] != "skipped"])
+    measured = with_ends(pd.DataFrame(table[table["state"] != "skipped"]))
     if measured["lambda_max"].dropna().empty:
-        raise InputError(
-            "expected at least one record that was not skipped, got none; train with a larger --probe-share"
-        )
+        raise InputError("expected at least one record that was not skipped, got none")
     runs = {str(name): RUNS[i % len(RUNS)] for i, name in enumerate(table["run"].unique())}
     with style():
-        figure = new_figure(PANEL * 5 + LEGEND_LINE * (len(runs) + 5))
-        panels = figure.subplots(5, 2)
-        for axes, name in zip(panels.flat, ATTRIBUTES, strict=False):
-            columns = f"trace_{name}", f"trace_{name}_low", f"trace_{name}_high"
-            _bands(axes, measured, runs, columns, f"trace of {attribute_name(name)}")
-        _gaussians(panels[2, 1], table, runs)
-        for axes, (name, title) in zip(panels[3], ENDS.items(), strict=True):
-            error = measured[f"{name}_error"]
-            known = measured.assign(low=measured[name] - error, high=measured[name] + error)
-            _bands(axes, known, runs, (name, "low", "high"), title)
-        for axes, (name, title) in zip(panels[4], INDICES.items(), strict=True):
-            axes.set_title(title)
-            index_over_steps(axes, measured, runs, name)
-            axes.set_xlabel("step")
-        for axes in panels.flat:
+        figure = new_figure(PANEL * 3 + LEGEND_LINE * (2 * len(runs) + 4))
+        for axes, (name, title) in zip(figure.subplots(3, 2).flat, PANELS.items(), strict=True):
+            axes.set_title(literal(title))
+            over_steps(axes, measured, runs, name)
             axes.grid(True)
             axes.xaxis.set_major_locator(step_ticks())
             if not any(np.isfinite(line.get_ydata()).any() for line in axes.lines):
                 axes.set(xticks=[], yticks=[], xlabel="")
                 axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center")
+        for axes in figure.axes[-2:]:
+            axes.set_xlabel("step")
+        figure.suptitle("\n".join(_happened(name, measured) for name in runs), fontsize=7.5, x=0.02, ha="left")
         handles = [Line2D([], [], color=colour, label=literal(name)) for name, colour in runs.items()]
-        handles += marker_words(measured, *INDICES)
+        handles += marker_words(measured, *PANELS)
         handles.append(Line2D([], [], linestyle="none", label=UNITS))
         figure.legend(handles=handles, loc="outside lower center", ncols=1)
     return figure
+
+
+def with_ends(measured: pd.DataFrame) -> pd.DataFrame:
+    """The rows with both ends of an interval for every panel: of eigenvalues from their errors, exact for the Gaussians."""
+    errors = {name: measured[f"{name}_error"] for name in ENDS} | {"gaussians": 0.0}
+    low = {f"{name}_low": measured[name] - error for name, error in errors.items()}
+    high = {f"{name}_high": measured[name] + error for name, error in errors.items()}
+    return measured.assign(**low, **high)
+
+
+def _happened(run: str, measured: pd.DataFrame) -> str:
+    """What became of a run's steepest curvature, in words."""
+    known = measured[(measured["run"] == run) & (measured["lambda_max"] > 0)]
+    if len(known) < 2:
+        return literal(f"{run}: one record of λ max")
+    first, last = known.iloc[0], known.iloc[-1]
+    times = rough(float(last["lambda_max"] / first["lambda_max"]))
+    return literal(f"{run}: λ max × {times} from step {first['step']:,} to {last['step']:,}")
 
 
 def step_ticks() -> MaxNLocator:
@@ -76,33 +90,28 @@ def step_ticks() -> MaxNLocator:
     return MaxNLocator(4, integer=True, steps=[1, 2, 2.5, 5, 10])
 
 
-def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], name: str) -> None:
-    """An index of every run over the steps, its magnitude on a logarithmic axis, with its bracket.  runs: name -> colour.
+def over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], name: str) -> None:
+    """A number of every run over the steps, its magnitude on a logarithmic axis, with its interval.  runs: name -> colour.
 
-    Hollow where it is negative.  Of one that has only a lower bound, the bound is drawn, as a triangle; without one, nothing.
-    The first run is drawn broad, below the others, so that it is seen where another one coincides with it.
+    Hollow where it is negative.  Of one with only a lower bound an arrow stands on that, without a line; without one, nothing.
     """
     axes.set_yscale("log")
-    for place, (run, colour) in enumerate(runs.items()):
-        broad = 1.0 if place or len(runs) == 1 else 2.2
+    axes.margins(0.08, 0.12)
+    for run, colour in runs.items():
         part = pd.DataFrame(measured[(measured["run"] == run) & measured[name].notna()])
         steps, values = part["step"].to_numpy(float), part[name].to_numpy(float)
-        magnitudes = np.abs(values)
-        ends = np.stack([np.abs(part[f"{name}_low"].to_numpy(float)), np.abs(part[f"{name}_high"].to_numpy(float))])
-        unbounded = ~np.isfinite(ends).all(axis=0)
-        low = np.fmin(np.nanmin(ends, axis=0, initial=np.inf), magnitudes)
-        shown = np.where(unbounded, low, magnitudes)
-        shown[shown == 0] = np.nan  # for which a logarithmic axis has no place
-        high = np.where(unbounded, shown, np.fmax(ends.max(axis=0), magnitudes))
-        axes.fill_between(steps, np.where(shown > 0, low, np.nan), high, color=colour, alpha=0.25, linewidth=0)
-        axes.plot(steps, shown, color=colour, linewidth=1.1 * broad)
-        for kind, marker in ((~unbounded, "o"), (unbounded, "^")):
-            for sign, face in ((values >= 0, colour), (values < 0, "white")):
-                chosen = kind & sign
-                axes.plot(
-                    steps[chosen], shown[chosen], marker, color=colour, markerfacecolor=face, markersize=3 * broad,
-                    linestyle="none",
-                )  # fmt: skip
+        ends = np.stack([part[f"{name}_{end}"].to_numpy(float) for end in ("low", "high")])
+        bounded, (low, high) = np.isfinite(ends).all(axis=0), np.abs(ends)
+        shown = np.where(bounded & (values != 0), np.abs(values), np.nan)  # 0 has no place on a logarithmic axis
+        inner = np.where(ends[0] * ends[1] < 0, 0.0, np.fmin(np.fmin(low, high), shown))
+        outer = np.fmax(np.fmax(low, high), shown)
+        axes.fill_between(steps, inner, outer, color=colour, alpha=0.25, linewidth=0)
+        axes.plot(steps, shown, color=colour, linewidth=1.1)
+        for sign, face in ((values >= 0, colour), (values < 0, "white")):
+            look: dict[str, Any] = {"markerfacecolor": face, "markersize": 3, "linestyle": "none"}
+            axes.plot(steps[sign], shown[sign], "o", color=colour, **look)
+        least = np.fmin(low, high)[~bounded]
+        axes.plot(steps[~bounded], np.where(least > 0, least, np.nan), color=colour, **ARROW)
     _few_decades(axes)
 
 
@@ -112,43 +121,16 @@ def marker_words(measured: pd.DataFrame, *names: str) -> list[Line2D]:
     ends = np.stack([measured[[f"{name}{end}" for name in names]].to_numpy(float) for end in ("_low", "_high")])
     bounds = np.isfinite(values) & ~np.isfinite(ends).all(axis=0)
     look: dict[str, Any] = {"color": BLACK, "markersize": 3, "linestyle": "none"}
-    hollow = Line2D([], [], marker="o", markerfacecolor="white", label="open: the index is negative", **look)
-    triangle = Line2D([], [], marker="^", label="triangle: at least so large", **look)
-    return [hollow] * bool((values < 0).any()) + [triangle] * bool(bounds.any())
-
-
-def _bands(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], columns: tuple[str, str, str], title: str) -> None:
-    """Curves of every run with their bands.  columns: of the values, and of both ends of the bands."""
-    lowest = float(np.nanmin(measured[columns[1]].to_numpy(float)))
-    highest = float(np.nanmax(measured[columns[2]].to_numpy(float)))
-    logarithmic = lowest > 0 and highest > 10 * lowest
-    exponent = 0 if logarithmic else exponent_of(measured[columns[0]].to_numpy(float))
-    axes.set_title(f"{literal(title)}\n{unit_suffix(exponent).strip()}".strip())
-    for run, colour in runs.items():
-        part = pd.DataFrame(measured[measured["run"] == run])
-        value, low, high = (part[name].to_numpy(float) / 10.0**exponent for name in columns)
-        axes.fill_between(part["step"], low, high, color=colour, alpha=0.25, linewidth=0)
-        axes.plot(part["step"], value, "-o", color=colour, markersize=2)
-    if logarithmic:
-        axes.set_yscale("log")
-        _few_decades(axes)
-    else:
-        axes.yaxis.set_major_locator(MaxNLocator(4))
-
-
-def _gaussians(axes: Axes, table: pd.DataFrame, runs: dict[str, str]) -> None:
-    axes.set_title("Gaussians")
-    for run, colour in runs.items():
-        part = table[table["run"] == run]
-        axes.plot(part["step"], part["gaussians"], "-o", color=colour, markersize=2)
-    axes.set_ylim(bottom=0)
-    axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    hollow = Line2D([], [], marker="o", markerfacecolor="white", label="open: the number is negative", **look)
+    arrow = Line2D([], [], color=BLACK, label="arrow: at least so large", **ARROW)
+    return [hollow] * bool((values < 0).any()) + [arrow] * bool(bounds.any())
 
 
 def _few_decades(axes: Axes) -> None:
-    """Ticks of a logarithmic axis: decades, or where it spans less than two of them, also 2 and 5."""
+    """Ticks of a logarithmic axis: decades; where it spans less than two of them also 2 and 5; less than one: round numbers."""
     low, high = axes.get_ylim()
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100 * low else (1.0,), numticks=6))
+    decades = LogLocator(subs=(1.0, 2.0, 5.0) if high < 100 * low else (1.0,), numticks=6)
+    axes.yaxis.set_major_locator(MaxNLocator(3) if high < 8 * low else decades)
     axes.yaxis.set_major_formatter(FuncFormatter(_tick))
     axes.yaxis.set_minor_formatter(NullFormatter())
 

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from analysis.commands.uses.options import GEOMETRY
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from figures.scripts import folder_script
@@ -66,40 +67,27 @@ def draw_curve(curve: pd.DataFrame) -> Figure:
     return figure
 
 
-RULES = {
-    "d": ("D-optimal, blocks", BLUE),
-    "t": ("T-optimal, blocks", SKY),
-    "e": ("E-optimal, blocks", PURPLE),
-    "d_diagonal": ("D-optimal, diagonal", GREEN),
-    "published": ("FisherRF's diagonal", VERMILION),
-    "uniform": ("uniform", BLACK),
-    "random": ("random", ORANGE),
-}
-
-
 def draw_gains(table: pd.DataFrame) -> Figure:
-    """Every gain of every candidate as a share of the largest, the picks first."""
+    """How far every candidate is behind the best, with twice its error, the picks first; the best by other rules are named."""
+    best, rows, equal = (
+        {rule: table[rule].idxmax() for rule in GEOMETRY},
+        range(len(table)),
+        table.behind <= 2 * table.error,
+    )
     with style():
-        figure = new_figure(1.2 + 0.16 * len(table))
+        figure = new_figure(0.9 + 0.16 * len(table))
         axes = figure.subplots()
-        rows = range(len(table))
-        for name in [name for name in RULES if name in table]:
-            words, colour = RULES[name]
-            axes.plot(
-                table[name] / table[name].max(),
-                rows,
-                color=colour,
-                label=words,
-                marker="o",
-                linestyle="none",
-                markersize=3,
-            )
-        picks = ["" if pd.isna(pick) else f"  ({pick:.0f})" for pick in table["pick"]]
-        axes.set_yticks(rows, [literal(f"{Path(str(name)).name}{pick}") for name, pick in zip(table["view"], picks)])
+        axes.errorbar(-table["behind"], rows, xerr=2 * table["error"], fmt="o", color=BLUE, markersize=3, linewidth=0.8)
+        labels = []
+        for place, (view, pick) in enumerate(zip(table["view"], table["pick"], strict=True)):
+            named = [rule for rule, at in best.items() if at == place]
+            words = ", ".join([*([f"pick {pick:.0f}"] if float(pick) > 0 else []), *named])
+            labels.append(literal(Path(str(view)).name + (f"  ({words})" if words else "")))
+        axes.set_yticks(rows, labels)
         axes.invert_yaxis()
-        axes.set(xlabel="gain over the best candidate's; (1): the first pick")
+        axes.set(xlabel="gain less that of the best, ± twice the error of the difference")
+        axes.set_title(f"{equal.sum()} of {len(table)} candidates are equal within their errors")
         axes.grid(visible=True)
-        figure.legend(loc="outside upper center", ncols=2)
     return figure
 
 

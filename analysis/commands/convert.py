@@ -80,10 +80,11 @@ def _to_tool(options: ConvertOptions, to: str) -> list[str]:
     extra: Mapping[str, np.ndarray] = found.extra
     if to == "graphdeco":
         gaussians = found.gaussians
-        content = splat_ply(gaussians, extra, found.tool, antialiased=found.antialiased)
+        content = splat_ply(gaussians, extra, found.tool, antialiased=found.antialiased, train=found.train)
     else:
         gaussians = baked(found.gaussians)
-        content = gsplat_bytes(gaussians, found.step or 0, extra, found.tool, antialiased=found.antialiased)
+        said = {"antialiased": found.antialiased, "train": found.train}
+        content = gsplat_bytes(gaussians, found.step or 0, extra, found.tool, **said)
     write_atomically(options.out, content)
     kept = [f"with {', '.join(extra)}"] if extra else []
     if gaussians is not found.gaussians:
@@ -164,4 +165,5 @@ def own_file(checkpoint: Checkpoint) -> tuple[SplatFile, Seen]:
     antialiased = seen.render.antialias != "none"
     tool = next((name for name in OURS if seen.is_that_of(name, antialiased=antialiased)), None)
     notes = () if shift is None else (shift_in_words(shift),)
-    return SplatFile(training.gaussians, OURS[0], tool, training.step, antialiased=antialiased, notes=notes), seen
+    said = {"antialiased": antialiased, "train": tuple(scene.train), "notes": notes}
+    return SplatFile(training.gaussians, OURS[0], tool, training.step, **said), seen

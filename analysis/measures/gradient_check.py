@@ -1,34 +1,41 @@
-"""H v against differences of the gradient, which other code computes, in double precision.
+"""H v against differences of the gradient, which other code computes, in double precision: a few views, each by itself.
 
-    |H v - P (g(theta + h v) - g(theta - h v)) / (2 h)| / |H v|,   v random
+    |H_m v - P (g_m(theta + h v) - g_m(theta - h v)) / (2 h)| / |H_m v|,   v random, m a view
 
-at the first of four steps h that is good enough for the check, else at the best of them.
+at the first of four steps h that is good enough for the check, else at the best of them, and for the worst of the views.
 
 g is autograd's, in float64, through the torch specification of the projection and the first-order kernels of
-compositing and loss; P leaves the quaternions' lengths out, as the operator does.  Splats are composited in the order of
-their depths at theta, in the operator's precision, because H is the Hessian at a fixed order.  The steps are tiny, because
-the loss has a kink at each zero residual and a jump wherever a splat's alpha falls under its threshold or a pixel stops: few
-lie within 1e-11 of a parameter, where float64 still leaves the differences four digits.
+compositing and loss; P leaves the quaternions' lengths out, as the operator does.  H is the Hessian on one smooth piece of the
+loss, that of theta, and so are the differences:
 
-Single precision may decide such cases otherwise than double: the order of depths that are equal to round-off, the sign of
-a residual near zero, a splat at the threshold.  Where its H v is not close enough to the differences, the check is made of
-the operator in float64, and the difference of the two products is reported apart:
+order   splats are composited in the order of their depths at theta, in the operator's precision
+signs   L1 has a kink at each residual of 0: every residual keeps the sign that it has at theta, in the operator's precision.
+        Those that change it from theta - h v to theta + h v are counted
+jumps   a pixel jumps where the alpha of a splat passes its threshold, or where it stops: its change is then not 2 h J v.
+        A step at which one does is not taken; a view without another step is left out, and counted
+
+Few such jumps lie within 1e-11 of a parameter, where float64 still leaves the differences four digits.
+
+Single precision may decide such cases otherwise than double: a splat at the threshold, and the depths that are equal to
+round-off.  Where its H v is not close enough to the differences, the check is made of the operator in float64, and the
+difference of the two products is reported apart:
 
     |H32 v - H64 v| / |H64 v|
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from math import inf, isnan, nan
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape import DerivativeCheck, ProjectedOperator, check_gradient
 from landscape.operators.checks import ROUND_OFFS
 from landscape.results import Progress
 from splat.curvature.hessian import SceneHessian
+from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import view_loss
 from splat.model.camera import Camera
@@ -37,9 +44,12 @@ from splat.model.settings import RenderSettings
 from splat.projection.reference import Splats, project
 from splat.render.autograd import project_by_kernel, rasterize_by_kernel
 from splat.render.backend import backend_of
+from splat.scenes.view import View
 
+FEW = 3  # views
 STEPS = (1e-10, 3e-11, 1e-11, 3e-12)  # per parameter; means in units of their spread
 MOST_MOVED = 5e-4  # sum of a step over all parameters: longer ones cross jumps, which the last two STEPS may
+JUMP = 1e-9  # of a colour: a splat at its threshold changes one by 4e-7 to 4e-3, a step of a smooth pixel is known to 1e-12
 CHUNK = 1 << 16  # Gaussians that autograd projects at a time
 MOVING = ("means", "conics", "opacities", "colours")  # of the splats; their depths give their order alone
 ENOUGH = ROUND_OFFS * torch.finfo(torch.float32).eps  # what a probe asks for
@@ -47,41 +57,55 @@ ENOUGH = ROUND_OFFS * torch.finfo(torch.float32).eps  # what a probe asks for
 
 @dataclass(frozen=True)
 class ProductCheck:
-    """difference: of H v from differences of the gradient.  rounding: of H v in single precision from H v in double; None
-    where single precision agreed with the differences, or was not used."""
+    """error: of H_m v from differences of the gradient, the largest over the views; step: at which.  Both nan where every view
+    was left out.  rounding: the largest of H v in single precision from H v in double; 0 where single precision agreed with the
+    differences, or was not used.  views, left_out: how many were compared, and were not, as pixels jump at every step.
+    signs: residuals that change theirs within the steps."""
 
-    difference: DerivativeCheck
-    rounding: float | None
+    error: float
+    step: float
+    rounding: float
+    views: int
+    left_out: int
+    signs: int
 
 
 def check_against_gradient(
-    hessian: SceneHessian, generator: torch.Generator, progress: Progress | None = None, views: int | None = None
+    hessian: SceneHessian, generator: torch.Generator, progress: Progress | None = None, views: int = FEW
 ) -> ProductCheck:
-    """The relative error of H v for one random v.
-
-    views: how many to take, from the first; all by default.  For some views, P leaves out the quaternions'
-    lengths alone: what is flat for all views together need not be flat for each.
-    """
-    objective = hessian.objective
-    leave_out = hessian.project if views is None else partial(_without_lengths, objective.active)
-    direction = leave_out(_direction(objective, generator)[:, None])[:, 0]
-    shown = range(len(objective.views))[:views]
-    operator = ProjectedOperator(SceneHessian(objective, keep_null=True, indices=shown), leave_out)
-    found = _differences(operator, objective, direction, progress, views)
-    if found.error <= ENOUGH or objective.active.flat.dtype == torch.float64:
-        return ProductCheck(found, None)
-    double = _in_double(objective, views)
-    exact = ProjectedOperator(SceneHessian(double, keep_null=True), partial(_without_lengths, double.active))
-    product, reference = operator.apply(direction[:, None]).double(), exact.apply(direction[:, None].double())
-    rounding = float((product - reference).norm() / reference.norm().clamp_min(torch.finfo(torch.float64).tiny))
-    return ProductCheck(_differences(exact, double, direction.double(), progress, None), rounding)
+    """The relative error of H_m v for one random v.  views: how many to take, spread evenly over all."""
+    objective, found = hessian.objective, []
+    direction = _without_lengths(objective.active, _direction(objective, generator)[:, None])[:, 0]
+    count = len(objective.views)
+    for index in sorted({round(i) for i in np.linspace(0, count - 1, min(views, count))}):
+        found.append(_of_view(objective, index, direction))
+        if progress:
+            progress(len(found), min(views, count), "views in double precision")
+    worst = max(found, key=lambda each: -1.0 if each.left_out else each.error)
+    counts = (sum(getattr(each, name) for each in found) for name in ("views", "left_out", "signs"))
+    return ProductCheck(worst.error, worst.step, max(each.rounding for each in found), *counts)
 
 
-def _in_double(objective: SceneObjective, views: int | None) -> SceneObjective:
-    """The same objective of these views, in float64."""
+def _of_view(objective: SceneObjective, index: int, direction: Float[Tensor, " p"]) -> ProductCheck:
+    view = objective.views[index]
+    linearized = objective.linearized[index]
+    product = _product(linearized, direction)
+    error, step, signs = _differences(objective, view, linearized, product, direction)
+    rounding = 0.0
+    if not error <= ENOUGH and objective.active.flat.dtype == torch.float32:
+        double = _in_double(objective, view)
+        reference = _product(double.linearized[0], direction.double())
+        rounding = float((product - reference).norm() / reference.norm().clamp_min(torch.finfo(torch.float64).tiny))
+        error, step, signs = _differences(double, view, double.linearized[0], reference, direction.double())
+    left_out = int(isnan(error))
+    return ProductCheck(error, step, rounding, 1 - left_out, left_out, signs)
+
+
+def _in_double(objective: SceneObjective, view: View) -> SceneObjective:
+    """The same objective of this view alone, in float64."""
     return SceneObjective(
         objective.active.to(torch.float64),
-        [view.with_image(view.image.double()) for view in objective.views[:views]],
+        [view.with_image(view.image.double())],
         objective.loss_of_active,
         objective.background.double(),
         objective.settings,
@@ -89,50 +113,60 @@ def _in_double(objective: SceneObjective, views: int | None) -> SceneObjective:
     )
 
 
+def _product(view: LinearizedView, direction: Float[Tensor, " p"]) -> Float64[Tensor, " p"]:
+    """P H_m v."""
+    return _without_lengths(view.gaussians, view.hvp(direction[:, None]))[:, 0].double()
+
+
 def _differences(
-    operator: ProjectedOperator,
-    objective: SceneObjective,
-    direction: Float[Tensor, " p"],
-    progress: Progress | None,
-    views: int | None,
-) -> DerivativeCheck:
-    center = objective.active.flat.double()
-    steps = [step for step in STEPS if step * len(center) <= MOST_MOVED or step in STEPS[-2:]]
-    gradient = _gradient(objective, progress, views, 2 * len(steps))
-    return check_gradient(operator, gradient, center, direction, steps, enough=ENOUGH)
+    objective: SceneObjective, view: View, linearized: LinearizedView, product: Float64[Tensor, " p"], direction: Tensor
+) -> tuple[float, float, int]:
+    """(error, step, signs) of the first step that is good enough, else of the best; (nan, nan, 0) where pixels jump at each."""
+    center, v, size = objective.active.flat.double(), direction.double(), float(product.norm())
+    change = linearized.jvp(direction[:, None])[0, :3].double()
+    gradient, target, best = _Gradient(objective, view, linearized), view.image.to(center), (nan, nan, 0)
+    for step in STEPS:
+        if step * len(center) > MOST_MOVED and step not in STEPS[-2:]:
+            continue
+        (ahead, at), (behind, before) = (gradient(center + sign * step * v) for sign in (1, -1))
+        if float((at - before - 2 * step * change).abs().max()) > JUMP:
+            continue
+        difference = float(((ahead - behind) / (2 * step) - product).norm())
+        error = difference / size if size else (inf if difference else 0.0)
+        if not error >= best[0]:
+            best = error, step, int(((at - target).sign() != (before - target).sign()).sum())
+        if error <= ENOUGH:
+            break
+    return best
 
 
-def _gradient(
-    objective: SceneObjective, progress: Progress | None, views: int | None, most: int
-) -> Callable[[Float[Tensor, " p"]], Float[Tensor, " p"]]:
-    """The gradient at any theta, in float64, each view composited in its order at the objective's own; most: calls of it."""
-    active, settings = objective.active, objective.settings
-    double, background = active.to(torch.float64), objective.background.double()
-    shown = objective.views[:views]
-    losses = [backend_of(double.flat).view_loss(view.image, objective.loss_settings, double.flat) for view in shown]
-    depths = [project_by_kernel(active, view.camera, settings).depths.double() for view in shown]
-    done = 0
+class _Gradient:
+    """The gradient of one view's loss at any theta, in float64, on the smooth piece of the objective's own theta."""
 
-    def gradient(theta: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
-        nonlocal done
-        at, total = double.with_flat(theta.detach()), double.with_flat(torch.zeros_like(theta))
-        regularizers = objective.regularizers(at)
-        for view, of_view, order in zip(shown, losses, depths, strict=True):
-            size = view.camera.width, view.camera.height
-            with torch.no_grad():
-                parts = [project(some, view.camera, settings) for _, some in _chunks(at)]
-            whole = (torch.cat([getattr(part, each.name) for part in parts]) for each in fields(Splats))
-            splats = replace(Splats(*whole), depths=order)
-            moving = [getattr(splats, name).requires_grad_() for name in MOVING]
-            image, _ = rasterize_by_kernel(splats, background, *size, settings)
-            _pull(torch.autograd.grad(view_loss(image, of_view), moving), at, total, view.camera, settings)
-            regularizers.add_gradient(total.flat)
-        done += 1
-        if progress:
-            progress(done, most, "gradients in double precision")
-        return _without_lengths(double, total.flat[:, None] / len(objective.views))[:, 0]
+    def __init__(self, objective: SceneObjective, view: View, linearized: LinearizedView) -> None:
+        self.active, self.camera, self.settings = objective.active.to(torch.float64), view.camera, objective.settings
+        self.background, self.regularizers = objective.background.double(), objective.regularizers
+        self.target, loss = view.image.to(self.active.flat), objective.loss_settings
+        self.loss = backend_of(self.active.flat).view_loss(view.image, loss, self.active.flat)
+        self.depths = project_by_kernel(objective.active, view.camera, objective.settings).depths.double()
+        self.signs = (linearized.image - view.image.to(linearized.image)).sign().double()
+        self.weight = loss.pixel_weight / self.target.numel() if loss.pixel == "l1" else 0.0
 
-    return gradient
+    def __call__(self, theta: Float64[Tensor, " p"]) -> tuple[Float64[Tensor, " p"], Float64[Tensor, "3 h w"]]:
+        """Gradient and render."""
+        at, total = self.active.with_flat(theta), self.active.with_flat(torch.zeros_like(theta))
+        with torch.no_grad():
+            parts = [project(some, self.camera, self.settings) for _, some in _chunks(at)]
+        splats = Splats(*(torch.cat([getattr(part, each.name) for part in parts]) for each in fields(Splats)))
+        splats = replace(splats, depths=self.depths)
+        moving = [getattr(splats, name).requires_grad_() for name in MOVING]
+        size = self.camera.width, self.camera.height
+        image, _ = rasterize_by_kernel(splats, self.background, *size, self.settings)
+        turned = self.signs - (image.detach() - self.target).sign()
+        loss = view_loss(image, self.loss) + self.weight * (turned * image).sum()
+        _pull(torch.autograd.grad(loss, moving), at, total, self.camera, self.settings)
+        self.regularizers(at).add_gradient(total.flat)
+        return _without_lengths(self.active, total.flat[:, None])[:, 0], image.detach()
 
 
 def _chunks(gaussians: Gaussians) -> Iterator[tuple[slice, Gaussians]]:

@@ -22,14 +22,24 @@ class PlaneSlice:
 
 
 @dataclass(frozen=True, eq=False)
+class Search:
+    """Both ends of the spectrum, and of the first TEN eigenpairs from either end, as far as they were found, the eigenvalue
+    and over how many Gaussians the eigenvector is spread."""
+
+    ends: EigenEnds
+    spreads: tuple[list[tuple[float, float]], list[tuple[float, float]]]
+
+
+@dataclass(frozen=True, eq=False)
 class Rendered:
     """Losses at finite steps along the eigenvectors of both ends (None of an eigenvalue 0), and the Gaussians that carry these.
 
-    steps: the optimiser's along each.
+    steps: the optimiser's along each; kinks: see `analysis.measures.steepest`.
     """
 
     ends: tuple[FiniteProbe | None, FiniteProbe | None]
     steps: tuple[float, float]
+    kinks: tuple[float, float]
     carriers: list[Carries]
 
 
@@ -59,7 +69,8 @@ class Measured:
     """Results of all stages; rendered, density, power, finite, depth, plane and shares are None where a note says why.
 
     matvecs: products H v of all stages; spared: products of single views, known to be 0 and left out; rank: number of
-    directions that are not exactly flat; unreached: stages that time did not reach; left_out: of training views, if any were.
+    directions that are not exactly flat; spreads: see `Search`; unreached: stages that time did not reach; left_out: of
+    training views, if any were.
     """
 
     value: float
@@ -68,6 +79,7 @@ class Measured:
     gradient_check: ProductCheck
     traces: dict[str, TraceEstimate]
     ends: EigenEnds
+    spreads: tuple[list[tuple[float, float]], list[tuple[float, float]]]
     power: EigenEnds | None
     density: SpectralDensity | None
     finite: FiniteProbe | None

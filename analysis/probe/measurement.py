@@ -35,16 +35,17 @@ from analysis.console.kept import Kept
 from analysis.console.stages import Stages
 from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import ProductCheck, check_against_gradient
-from analysis.measures.localization import mass_shares
+from analysis.measures.localization import mass_shares, masses, participation
 from analysis.measures.memory import basis_within, vectors_within
-from analysis.measures.steepest import heaviest
-from analysis.probe.measured import LeftOut, Measured, PlaneSlice, Rendered, Spectrum
+from analysis.measures.steepest import heaviest, kink_curvature
+from analysis.probe.measured import LeftOut, Measured, PlaneSlice, Rendered, Search, Spectrum
 from analysis.probe.plan import MOST_AT_ONCE
-from analysis.probe.settings import FEWEST_STEPS, ProbeSettings
+from analysis.probe.settings import FEWEST_STEPS, TEN, ProbeSettings
 from analysis.records.schema import Depth
 from landscape import (
     CountingOperator,
     EigenEnds,
+    Eigenpairs,
     OperatorCheck,
     TraceEstimate,
     check_operator,
@@ -58,6 +59,7 @@ from landscape import (
 from landscape.eigen.lanczos import LanczosFactorization
 from landscape.eigen.power import power_of_runs
 from landscape.operators.distributed import ALONE, DistributedOperator, Ranks
+from landscape.operators.operator import LiftedOperator
 from landscape.probes import spawn
 from landscape.results import Progress
 from landscape.slices.finite_probe import FiniteProbe, finite_probe
@@ -71,6 +73,7 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.shares import BlockShare, block_shares
 from splat.curvature.traces import block_traces, exact_traces
+from splat.model.gaussians import Gaussians
 from splat.render.backend import CPU, backend_of
 
 STAGES = (
@@ -91,6 +94,7 @@ LEFT_OUT = {  # notes on stages that the settings exclude
 }
 # longest step of renders along the ends: change of the loss, and from the optimiser's step
 RISE, MOST_DOUBLINGS = 0.01, 7
+MIXED = 0.1  # largest error of an eigenvector whose spread is told: 1% of its mass lies elsewhere
 FEW_POINTS = 8  # renders that tell the noise of one
 MOST_SAMPLES = 64  # of a trace on a CPU: more would take longer than summing the exact blocks
 
@@ -176,8 +180,9 @@ def _all_stages(
     """The stages after the checks.  of_checks: `_Point.work` that these took."""
     settings = at.settings
     traces = kept.run("traces", dict[str, TraceEstimate], partial(_traces, at, kept), ends_in_time=True)
-    ends = kept.run("eigenvalues", EigenEnds, partial(_ends, at, kept), ends_in_time=True)
-    assert traces is not None and ends is not None  # stages that end in time always return something
+    search = kept.run("eigenvalues", Search, partial(_ends, at, kept), ends_in_time=True)
+    assert traces is not None and search is not None  # stages that end in time always return something
+    ends = search.ends
     rendered = kept.run("renders", Rendered, partial(_rendered, at, ends, lengths))
     plane = kept.run("slice", PlaneSlice | None, partial(_plane, at, ends))  # pyright: ignore[reportArgumentType]
     spectrum = power = finite = depth = None
@@ -200,6 +205,7 @@ def _all_stages(
         gradient_check=gradient_check,
         traces=traces,
         ends=ends,
+        spreads=search.spreads,
         power=power or (spectrum and spectrum.power),
         density=spectrum and spectrum.density,
         finite=finite,
@@ -235,8 +241,11 @@ def _traces(
     return {name: exact[name] if name in inexact else trace for name, trace in found.items()}
 
 
-def _ends(at: _Point, kept: Kept, generator: torch.Generator, report: Progress, notes: list[str]) -> EigenEnds:
-    """Both ends of the spectrum, in the time that is left and with the largest basis that fits into memory."""
+def _ends(at: _Point, kept: Kept, generator: torch.Generator, report: Progress, notes: list[str]) -> Search:
+    """Both ends of the spectrum, in the time that is left and with the largest basis that fits into memory.
+
+    The null space that is known is lifted off 0, where it would be the end of a semi-definite spectrum.
+    """
     eigen, memory = at.settings.eigen, at.settings.memory
     basis = basis_within(eigen, vectors_within(at.objective, memory))
     if basis < eigen.basis:
@@ -246,7 +255,23 @@ def _ends(at: _Point, kept: Kept, generator: torch.Generator, report: Progress, 
         )
     start = BlockEigenvectors(at.objective, *at.objective.approximate_blocks).warm_start()
     eigen = replace(eigen, max_seconds=kept.left, basis=basis)
-    return extreme_eigenpairs(at.operator, generator, eigen, start, report)
+    lifted = LiftedOperator(at.operator, at.hessian.project, spawn(generator))
+    found = extreme_eigenpairs(lifted, generator, eigen, start, report)
+    assert found.further is not None
+    ends, active = zip((found.largest, found.smallest), found.further, strict=True), at.objective.active
+    spreads = [_spreads(pairs, active) for pairs in ends]
+    return Search(replace(found, further=None), (spreads[0], spreads[1]))
+
+
+def _spreads(pairs: Sequence[Eigenpairs], gaussians: Gaussians) -> list[tuple[float, float]]:
+    """Eigenvalue, and participation over Gaussians, of the first TEN pairs, up to one that its neighbours are mixed into."""
+    rows = []
+    for some in pairs:
+        for i in range(len(some)):
+            if len(rows) == TEN or not some.vector_errors[i] <= MIXED:
+                return rows
+            rows.append((float(some.values[i]), participation(masses(some.vectors[:, i], gaussians))))
+    return rows
 
 
 def _spectrum(
@@ -289,7 +314,12 @@ def _finite(at: _Point, ends: EigenEnds, _: torch.Generator, report: Progress, _
 
 
 def _rendered(
-    at: _Point, ends: EigenEnds, lengths: Mapping[str, float], _: torch.Generator, report: Progress, __: list[str]
+    at: _Point,
+    ends: EigenEnds,
+    lengths: Mapping[str, float],
+    generator: torch.Generator,
+    report: Progress,
+    _: list[str],
 ) -> Rendered:
     """Renders along both ends, and who carries these."""
     probes, steps, objective = [], [], at.objective
@@ -304,8 +334,10 @@ def _rendered(
         probe = partial(finite_probe, objective.evaluate, objective.active.flat, pair.vectors[:, 0], at.operator)
         probes.append(probe(along, report, FEW_POINTS) if value and step else None)
         steps.append(step)
-    carriers = heaviest(objective, [pair.vectors[:, 0] for pair in pairs])
-    return Rendered((probes[0], probes[1]), (steps[0], steps[1]), carriers)
+    vectors = [pair.vectors[:, 0] for pair in pairs]
+    kinks = [kink_curvature(objective, vector) for vector in vectors]
+    carriers = heaviest(objective, vectors, generator)
+    return Rendered((probes[0], probes[1]), (steps[0], steps[1]), (kinks[0], kinks[1]), carriers)
 
 
 def _depth(at: _Point, accuracy: TraceSettings, generator: torch.Generator, report: Progress, _: list[str]) -> Depth:

@@ -6,12 +6,13 @@ from math import isfinite, nan
 
 import numpy as np
 from jaxtyping import Float64
-from msgspec import UNSET, UnsetType, convert
+from msgspec import UNSET, UnsetType, convert, structs
 from torch import Tensor
 
 from analysis.measures.gradient_check import ENOUGH
 from analysis.measures.localization import conditions, localize, mass_shares
 from analysis.probe.measured import LeftOut, Measured, PlaneSlice
+from analysis.probe.settings import TEN
 from analysis.records import schema
 from analysis.records.provenance import Provenance
 from analysis.records.records import Check, Counts, ProbeRecord, Skip, counts_of, objective_of
@@ -19,6 +20,8 @@ from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, eigenvalue_ratio
 from landscape.results import Bracket, finite_or_none, sampling_error
 from landscape.slices.finite_probe import FiniteProbe
+from landscape.spectrum.concentration import half, top
+from landscape.spectrum.rules import SpectralDensity
 from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.shares import BlockShare
 from splat.curvature.traces import curvature_scale
@@ -39,6 +42,7 @@ def probe_record(
         traces={name: _trace(trace, left_out, seen.get(name)) for name, trace in found.traces.items()},
         eigenvalues=_eigenvalues(found, objective),
         anisotropy=_anisotropy(found),
+        concentration=UNSET if found.density is None else _concentration(found.density),
         finite_probe=None
         if found.finite is None
         else convert({**found.finite.record(), "direction": NAMES[0]}, schema.FiniteProbe),
@@ -46,7 +50,7 @@ def probe_record(
         block_shares=UNSET if found.shares is None else [_block_share(one) for one in found.shares],
         slice=None if found.plane is None else _slice(found.plane, found.ends.largest),
         counts=_counts(found, objective),
-        checks=_checks(found),
+        checks=_checks(found, objective.counts.views),
         notes=[
             *found.notes,
             *_unreached(found),
@@ -127,10 +131,12 @@ def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalu
     if power is not None:
         rows.power_max, rows.power_min = eigenvalue(power, power.largest), eigenvalue(power, power.smallest)
     if found.rendered is not None:
-        rendered = zip(found.rendered.ends, found.rendered.steps, found.rendered.carriers, strict=True)
-        for end, (probe, step, carrier) in zip((rows.max, rows.min), rendered, strict=True):
-            end.carrier = carrier
-            end.renders = UNSET if probe is None else _renders(probe, step)
+        made = found.rendered
+        rendered = zip(made.ends, made.steps, made.kinks, made.carriers, found.spreads, strict=True)
+        for end, (probe, step, kinks, carrier, spreads) in zip((rows.max, rows.min), rendered, strict=True):
+            wide = [(i + 1, *pair) for i, pair in enumerate(spreads) if pair[1] > TEN]
+            end.carrier = structs.replace(carrier, found=len(spreads), wide=wide[0] if wide else UNSET)
+            end.renders = UNSET if probe is None else _renders(probe, step, kinks)
     if found.left_out is not None:
         for end, curvatures in zip((rows.max, rows.second, rows.min), found.left_out.curvatures.T, strict=True):
             if end:
@@ -139,7 +145,7 @@ def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalu
     return rows
 
 
-def _renders(probe: FiniteProbe, step: float) -> schema.Renders:
+def _renders(probe: FiniteProbe, step: float, kinks: float) -> schema.Renders:
     """step: the optimiser's along this direction."""
     confirmed, steps = probe.confirmation(step / 10)
     low, high = steps or (None, None)
@@ -150,7 +156,7 @@ def _renders(probe: FiniteProbe, step: float) -> schema.Renders:
     }
     return convert(
         {name: [finite_or_none(x) for x in found.tolist()] for name, found in numbers.items()}
-        | {"confirmed": confirmed, "low": low, "high": high, "optimiser_step": step},
+        | {"confirmed": confirmed, "low": low, "high": high, "optimiser_step": step, "kinks": kinks},
         schema.Renders,
     )
 
@@ -173,6 +179,11 @@ def _anisotropy(found: Measured) -> schema.Anisotropy:
     if found.power is not None:
         indices.eigenvalue_ratio = paper_index(found.ends, found.power)
     return indices
+
+
+def _concentration(density: SpectralDensity) -> schema.Concentration:
+    brackets = {"half": half(density), "top_10": top(density, 10), "top_100": top(density, 100)}
+    return schema.Concentration(**{name: index_of(bracket) for name, bracket in brackets.items()})
 
 
 def paper_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
@@ -254,23 +265,27 @@ def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, fl
     return skips
 
 
-def _checks(found: Measured) -> dict[str, Check]:
-    operator, derivative, rounding = (
-        found.operator_check,
-        found.gradient_check.difference,
-        found.gradient_check.rounding,
-    )
-    noise, noise_note, note = operator.noise, UNSET, f"gradients {derivative.step:.0e} apart"
-    if rounding is not None:
-        noise = max(noise, rounding)
+def _checks(found: Measured, views: int) -> dict[str, Check]:
+    operator, gradient = found.operator_check, found.gradient_check
+    noise, noise_note = operator.noise, UNSET
+    note = f"{gradient.views} of {views} views, each by itself; gradients {gradient.step:.0e} apart"
+    if gradient.signs:
+        note += f", across the kinks of {gradient.signs} residuals, which are left out"
+    if gradient.left_out:
+        note += f"; {gradient.left_out} more jump at every step, and are left out"
+    if gradient.rounding:
+        noise = max(noise, gradient.rounding)
         noise_note = "single against double precision, which order depths that are nearly equal each its own way"
-        note += ", products in double precision"
+        note += "; products in double precision"
+    compared = Check(value=None, bound=None, passed=None, note=note)
+    if gradient.views:
+        # differences are not much better in float64: hence ENOUGH
+        compared = _check(gradient.error, max(operator.tolerance, ENOUGH), note)
     return {
         "symmetry": _check(operator.symmetry, operator.tolerance),
         "round_off": _check(noise, operator.tolerance, noise_note),
         "finiteness": _check(0.0 if operator.finite else 1.0, 0.0),
-        # differences are not much better in float64: hence ENOUGH
-        "finite_difference": _check(derivative.error, max(operator.tolerance, ENOUGH), note),
+        "finite_difference": compared,
     }
 
 

@@ -3,19 +3,21 @@
 from dataclasses import dataclass, field
 
 from analysis.measures.depth import STEPS as DEPTH_STEPS
+from analysis.measures.gradient_check import FEW
 from landscape import EigenSettings, PowerSettings, TraceSettings
 from landscape.errors import InputError
 from landscape.slices.finite_probe import NOISE_POINTS, STEPS
 
 FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density's run and along a side of a slice
 FEWEST_PRODUCTS = 16  # of a density
+TEN = 10  # eigenpairs from either end, of which the spread over Gaussians is told
 
 
 @dataclass(frozen=True)
 class ProbeSettings:
     """Amounts of everything; the defaults are for numbers to 1%.
 
-    checked_vectors, checked_views: of the self-checks; None: all views.
+    checked_vectors, checked_views: of the self-checks.
     trace_samples: exactly so many for each trace; None: as many as `traces` asks for.
     power: iterates of power iteration; power_apart: with products of its own.  density_matvecs: products of the spectral
         density (a tenth of them see the ends again); 0: it is left out.
@@ -31,10 +33,10 @@ class ProbeSettings:
     """
 
     checked_vectors: int = 4
-    checked_views: int | None = None
+    checked_views: int = FEW
     traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.01, max_probes=2048))
     trace_samples: int | None = None
-    eigen: EigenSettings = field(default_factory=lambda: EigenSettings(largest=2, smallest=1, max_matvecs=3000))
+    eigen: EigenSettings = field(default_factory=lambda: EigenSettings(2, 1, max_matvecs=3000, further=TEN - 1))
     power: PowerSettings = field(default_factory=lambda: PowerSettings(max_matvecs=40))
     power_apart: bool = False
     density_matvecs: int = 108
@@ -72,7 +74,7 @@ class ProbeSettings:
             checked_views=1,
             traces=TraceSettings(rtol=0.1),
             trace_samples=5,
-            eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=1000),
+            eigen=EigenSettings(2, 1, rtol=0.1, max_matvecs=1000, further=TEN - 1),
             density_matvecs=0,
             slice_points=21,
             slice_plane=False,

@@ -1,6 +1,7 @@
-"""A probe in eight lines, for the terminal, and what has to be said beside them.
+"""A probe in ten lines, for the terminal, and what has to be said beside them.
 
-Numbers have two digits; the errors beside them are named.  "one training": a number that another seed changes.
+What repeats over seeds comes first.  Numbers have two digits; the errors beside them are named.  "one training": a number that
+another seed changes.  Where a check of the derivatives failed, no number that is made of them stands here.
 """
 
 from collections.abc import Mapping
@@ -20,20 +21,29 @@ ONE = "one training"
 
 
 def summary(data: ProbeRecord, report: Path) -> list[str]:
-    """Lines on the scene, both ends of the spectrum, a step of the optimiser, the spread, the checks, and the page to open."""
+    """Lines on the scene, a step of the optimiser, the spread, both ends of the spectrum, the checks, and the page to open."""
     counts, made, ends = data.counts, data.provenance, data.eigenvalues
     lines = {
         "scene": f"{made.scene or 'scene'}, {steps_made(made.iteration or 0, bool(made.origin))}, {_views(counts)}; "
         f"{counts.visible_gaussians:,} Gaussians in sight",
-        "steepest": _end(ends.max),
-        "negative" if (ends.min.value or 0.0) < 0 else "lowest": _end(ends.min),
         "a step": _step(data),
         "spread": _spread(data),
-        "checks": f"{_checks(data)}; {data.timing['total']:.0f} s",
+        "steepest": _end(ends.max),
+        "negative" if (ends.min.value or 0.0) < 0 else "lowest": _end(ends.min),
         "seeds": f"{ONE}: other seeds give other extreme eigenvalues (landscape compare, three seeds of each)",
-        "report": f"{report}",
     }
+    if doubtful := _doubtful(data):
+        words = f"the check of {' and '.join(doubtful)} failed, which puts every curvature in doubt: none is told"
+        lines = {"scene": lines["scene"], "curvature": words}
+    lines |= {"checks": f"{_checks(data)}; {data.timing['total']:.0f} s", "report": f"{report}"}
     return [f"{name:<9} {text}" for name, text in lines.items() if text]
+
+
+def _doubtful(data: ProbeRecord) -> list[str]:
+    """Checks of the derivatives that failed; round-off is an error that numbers have, and leaves them their meaning."""
+    return [
+        name.replace("_", " ") for name, check in data.checks.items() if check.passed is False and name != "round_off"
+    ]
 
 
 def steps_made(steps: int, foreign: bool) -> str:
@@ -84,13 +94,23 @@ def _end(end: Eigenvalue) -> str:
 
 
 def _carrier(end: Eigenvalue) -> str:
+    """Who carries an eigenvector, beside a random vector, and whether its neighbours in the spectrum are as narrow."""
     carrier = end.carrier
     if not carrier:
         return ""
+    random = f"(of a random direction {percent(carrier.random_share)})"
     if carrier.share < CARRIED:
-        return f": over many Gaussians, at most {percent(carrier.share)} on one"
+        return f": over many Gaussians, at most {percent(carrier.share)} on one {random}"
     shape = f"{carrier.shape}, " if carrier.shape else ""
-    return f": {percent(carrier.share)} on Gaussian {carrier.gaussian:,}, {shape}{MOVED[carrier.attribute]}"
+    text = f": {percent(carrier.share)} on Gaussian {carrier.gaussian:,} {random}, {shape}{MOVED[carrier.attribute]}"
+    if carrier.wide:
+        place, value, _ = carrier.wide
+        return (
+            f"{text}; number {place} from this end ({rough(value)}) is the first eigenvector on more than ten Gaussians"
+        )
+    if carrier.found == 1:
+        return text
+    return f"{text}; none of the first {carrier.found} eigenvectors from this end lies on more than ten Gaussians"
 
 
 def _rendered(end: Eigenvalue) -> str:
@@ -101,7 +121,10 @@ def _rendered(end: Eigenvalue) -> str:
         return f"renders agree from {rough(renders.low)} to {rough(renders.high)}"
     if renders.confirmed is None:
         return "not resolved: round-off hides it in renders"
-    return "not confirmed by renders" + (": no saddle is claimed" if (end.value or 0.0) < 0 else "")
+    value, why = end.value or 0.0, ""
+    if renders.kinks > abs(value):
+        why = f", as kinks of L1, which it leaves out, have {rough(renders.kinks)}"
+    return f"not confirmed by renders{why}" + (": no saddle is claimed" if value < 0 else "")
 
 
 def _step(data: ProbeRecord) -> str:
@@ -114,23 +137,25 @@ def _step(data: ProbeRecord) -> str:
         return shares[name] * traces[name].magnitudes[end]
 
     ranked = sorted(shares, key=lambda name: -shares[name] * abs(traces[name].value or 0.0))
-    text = SHORT.get(ranked[0], ranked[0])
-    for before, name in pairwise(ranked):
-        text += (", then " if change(before, 0) > change(name, 1) else " ≈ ") + SHORT.get(name, name)
-    first = largest_steps(data)
-    times = f" ({first[2]:.2g} times as much as in {SHORT.get(first[1], first[1])})" if first else ""
-    return f"of the optimiser changes the loss most in {text}{times}"
+    parts = [SHORT.get(name, name) for name in ranked]
+    joined = [", then " if change(before, 0) > change(name, 1) else " ≈ " for before, name in pairwise(ranked)]
+    if first := largest_steps(data):
+        text = f"of the optimiser in {parts[0]} changes the loss {first[2]:.2g} times as much as in {parts[1]}"
+        return text + "".join(map("".join, zip(joined[1:], parts[2:], strict=True)))
+    return f"of the optimiser changes the loss most in {parts[0]}" + "".join(
+        map("".join, zip(joined, parts[1:], strict=True))
+    )
 
 
 def _spread(data: ProbeRecord) -> str:
-    """The participation ratio and the steepest direction's part, as far as the density knows them."""
-    ratio, share, parts = data.anisotropy.participation_ratio, data.anisotropy.top_mass, []
+    """In how many directions half of all curvature lies, and the participation ratio, as far as the density knows them."""
+    known, ratio, parts = data.concentration, data.anisotropy.participation_ratio, []
+    if known:
+        ends = [rough(end) for end in (known.half.low, known.half.high)]
+        among = ends[0] if ends[0] == ends[1] else " to ".join(ends)
+        parts.append(f"half of all curvature lies in {among} of {data.counts.active_parameters:,} directions")
     if ratio and ratio.value is not None and not is_loose(ratio):
-        parts.append(
-            f"a participation ratio of {rough(ratio.value)} among {data.counts.active_parameters:,} directions"
-        )
-    if share and share.value is not None and not is_loose(share):
-        parts.append(f"the steepest holds {percent(share.value)} of all curvature")
+        parts.append(f"participation ratio {rough(ratio.value)}")
     return "; ".join(parts)
 
 

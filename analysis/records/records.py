@@ -129,6 +129,7 @@ class ProbeRecord(Struct, kw_only=True):
     traces: dict[str, schema.Trace]
     eigenvalues: schema.Eigenvalues
     anisotropy: schema.Anisotropy
+    concentration: Maybe[schema.Concentration] = UNSET
     finite_probe: schema.FiniteProbe | None = None
     depth: schema.Depth | None = None
     block_shares: Maybe[list[schema.BlockShare]] = UNSET

@@ -33,7 +33,6 @@ CHECKPOINT, METRICS, SECONDS, RECORDS, COMPARISON = (
     "checkpoint.pt", "metrics.json", "seconds.json", "trajectory.csv", "compare.json",
 )  # fmt: skip
 MAP = "map"  # RUN/map, a folder of `landscape map`
-NO_TIME = "no time"  # how the note of a record of a trajectory begins that was skipped for that
 STATES = ("whole", "coarse", "skipped")  # of a record of a trajectory
 TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}

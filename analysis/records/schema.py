@@ -166,13 +166,15 @@ class Renders(Struct, kw_only=True):
     steps: along v, stored units, each twice the one before; ratios: to the quadratic model, of the second difference to the
     eigenvalue; errors: of these, four standard errors of round-off.  confirmed: null where round-off decides; low, high: of
     the steps that confirm.  optimiser_step: the root mean square length along v of a step with random signs, as long as the
-    optimiser's first in every parameter: one of the steps.
+    optimiser's first in every parameter: one of the steps.  kinks: the curvature of L1's kinks along v, which the eigenvalue
+    leaves out (`analysis.measures.steepest`).
     """
 
     confirmed: bool | None
     low: Number = None
     high: Number = None
     optimiser_step: NonNegative
+    kinks: NonNegative = 0.0
     steps: list[float]
     ratios: list[Number]
     errors: list[Number]
@@ -188,14 +190,19 @@ class Renders(Struct, kw_only=True):
 class Carries(Struct, kw_only=True):
     """The Gaussian with most mass in an eigenvector.
 
-    gaussian: its number among all of the checkpoint.  share: of |v|^2.  attribute: that of most mass in it.  shape: kind and
-    place of its splat, in words; empty where processes share the views or a GPU has them.
+    gaussian: its number among all of the checkpoint.  share: of |v|^2; random_share: the largest that a Gaussian has of a
+    random vector.  attribute: that of most mass in it.  shape: kind and place of its splat, in words; empty where processes
+    share the views or a GPU has them.  found: of the first ten eigenpairs from this end, those that the search found; wide: of
+    these, the first on more than ten Gaussians: place, eigenvalue, participation over Gaussians; absent where there is none.
     """
 
     gaussian: Count
     share: Portion
+    random_share: Portion = 0.0
     attribute: str
     shape: str = ""
+    found: Count = 0
+    wide: Maybe[tuple[Count, float, float]] = UNSET
 
 
 class Eigenvalue(End, kw_only=True):
@@ -259,6 +266,17 @@ class Anisotropy(Named[Index], kw_only=True):
 
 
 INDICES = Anisotropy.__struct_fields__
+
+
+class Concentration(Named[Index], kw_only=True):
+    """In how few directions the curvature lies (`landscape.spectrum.concentration`), with brackets over start vectors.
+
+    half: the number of directions that hold half of all curvature.  top_10, top_100: the share that so many hold.
+    """
+
+    half: Index
+    top_10: Index
+    top_100: Index
 
 
 class FiniteProbe(Struct, kw_only=True):

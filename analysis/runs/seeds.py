@@ -2,7 +2,7 @@
 
 spread      standard deviation over the runs of a group, with n - 1; unknown for one run
 apart       two groups of two runs or more are in a quantity where their means differ by more than two standard deviations of
-            a difference of two single runs, 2 sqrt(s^2 + t^2); two single runs of one where their intervals do not meet
+            a difference of two single runs, 2 sqrt(s^2 + t^2)
 """
 
 import hashlib
@@ -22,6 +22,7 @@ from splat.training.origin.subject import Checkpoint
 TOLD = ("held-out views", "trace", "spectrum", "anisotropy")  # sections whose differences are told
 MORE = {"top mass": 1, "participation ratio": -1}  # the sign of an index where curvature is less even
 SPREADS = 2.0
+EQUAL = 1.1  # largest ratio of numbers of Gaussians that count as the same
 
 
 @dataclass(frozen=True)
@@ -92,22 +93,16 @@ def _together(entries: Sequence[Entry]) -> Entry:
 
 
 def sayings(rows: Sequence[Row], groups: Sequence[Group]) -> list[str]:
-    """Lines on differences from the first group beyond the spread of seeds, and on indices that contradict each other.
+    """Lines on differences from the first group beyond the spread of seeds, and on which is the more anisotropic.
 
     rows: those of `grouped`.
     """
-    several = all(len(group.folders) > 1 for group in groups)
-    told = [row for row in rows if row.section in TOLD and not row.name.startswith(" ")]
-    lines = [] if several else [
-        "Whether a difference is larger than the spread of seeds is not known of groups of one run: train with other "
-        "seeds (landscape sweep), and give the folders that hold them, or --group LABEL=RUN,RUN."
-    ]  # fmt: skip
+    told, lines = [row for row in rows if row.section in TOLD and not row.name.startswith(" ")], []
     for i, group in enumerate(groups[1:], start=1):
-        pair = f"{group.label} and {groups[0].label}"
-        if len(group.folders) > 1 and len(groups[0].folders) > 1:
-            lines.append(_differences(told, i, pair))
         seeds = len(group.folders) > 1 and len(groups[0].folders) > 1
-        lines.append(_contradictions(told, i, group.label, groups[0].label, seeds))
+        if seeds:
+            lines.append(_differences(told, i, f"{group.label} and {groups[0].label}"))
+        lines.append(_verdict(rows, i, group.label, groups[0].label, seeds=seeds))
     return lines
 
 
@@ -116,7 +111,7 @@ def _differences(rows: Sequence[Row], i: int, pair: str) -> str:
     for row in rows:
         here, there = row.entries[i], row.entries[0]
         if isinstance(here.value, float) and isinstance(there.value, float):
-            apart = _apart(here, there, True)
+            apart = _apart(here, there)
             name = f"trace of {row.name}" if row.section == "trace" else row.name
             (larger if apart else within).append(
                 f"{name} ({here.cell.value} and {there.cell.value})" if apart else name
@@ -127,31 +122,47 @@ def _differences(rows: Sequence[Row], i: int, pair: str) -> str:
     return f"{words}{'; not in ' + ', '.join(within) if larger and within else ''}."
 
 
-def _contradictions(rows: Sequence[Row], i: int, label: str, first: str, seeds: bool) -> str:
-    """Lines on indices that disagree about which of two groups is more anisotropic.  seeds: whether both have several runs."""
-    pair = f"{label} and {first}"
+def _verdict(rows: Sequence[Row], i: int, label: str, first: str, *, seeds: bool) -> str:
+    """Which of two groups is the more anisotropic, or why that is undecided.  seeds: whether both have several runs."""
     votes: dict[str, list[str]] = {label: [], first: []}
     for row in rows:
         here, there = row.entries[i], row.entries[0]
-        if row.section == "anisotropy" and row.name in MORE and _apart(here, there, seeds):
+        if row.section == "anisotropy" and row.name in MORE and _apart(here, there):
             assert isinstance(here.value, float) and isinstance(there.value, float)
             votes[label if (here.value - there.value) * MORE[row.name] > 0 else first].append(row.name)
-    if not any(votes.values()):
-        return f"No index decides whether {pair} differ in anisotropy."
-    if not all(votes.values()):
-        more = label if votes[label] else first
-        return f"The indices that decide ({', '.join(votes[more])}) agree: {more} is the more anisotropic of {pair}."
-    return "The indices contradict each other: " + ", but ".join(
-        f"by {' and '.join(names)} {which} is the more anisotropic" for which, names in votes.items()
-    ) + "."  # fmt: skip
+    why = [] if seeds else [
+        "one training of each says nothing of other seeds (landscape sweep trains them; give the folders that hold them, or "
+        "--group LABEL=RUN,RUN)"
+    ]  # fmt: skip
+    if uneven := _uneven(rows, i):
+        why.append(uneven)
+    if seeds and not any(votes.values()):
+        why.append("no index differs by more than the spread of the seeds")
+    if all(votes.values()):
+        why.append(
+            "the indices contradict each other: "
+            + ", but ".join(f"by {' and '.join(names)} it is {which}" for which, names in votes.items())
+        )
+    if why:
+        return f"Undecided which of {label} and {first} is the more anisotropic, because {'; '.join(why)}."
+    more = label if votes[label] else first
+    return f"{more} is the more anisotropic of {label} and {first}, by {' and '.join(votes[more])}."
 
 
-def _apart(here: Entry, there: Entry, seeds: bool) -> bool:
-    """Whether two entries are apart, by their spreads, or as single runs by their intervals."""
+def _uneven(rows: Sequence[Row], i: int) -> str:
+    """Why numbers of Gaussians forbid a verdict: they are not equal, and what their number alone does is not known."""
+    counts = [row.entries for row in rows if (row.section, row.name) == ("run", "Gaussians")]
+    here, there = (float(counts[0][j].value or 0) for j in (i, 0)) if counts else (1.0, 1.0)
+    split = [row.entries for row in rows if row.section == "anisotropy" and row.name.startswith(" ")]
+    if max(here, there) <= EQUAL * min(here, there) or any(row[i].value and row[0].value for row in split):
+        return ""
+    return f"{here:,.0f} Gaussians against {there:,.0f} make an anisotropy of their own, which --split-control would measure"
+
+
+def _apart(here: Entry, there: Entry) -> bool:
+    """Whether the means of two groups are apart by the spreads of their runs."""
     numbers = [here.value, there.value, here.low, here.high, there.low, there.high]
     if not all(isinstance(each, float) and isfinite(each) for each in numbers):
         return False
     a, b, *ends = (float(each or 0.0) for each in numbers)
-    if seeds:
-        return abs(a - b) > SPREADS * sqrt(((ends[1] - ends[0]) / 2) ** 2 + ((ends[3] - ends[2]) / 2) ** 2)
-    return ends[0] > ends[3] or ends[2] > ends[1]
+    return abs(a - b) > SPREADS * sqrt(((ends[1] - ends[0]) / 2) ** 2 + ((ends[3] - ends[2]) / 2) ** 2)

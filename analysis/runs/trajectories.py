@@ -20,7 +20,7 @@ from analysis.console.drawing import draw
 from analysis.console.plain import say
 from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.quantities import measured, quantity
-from analysis.records.run_files import CHECKPOINT, ENDS, NO_TIME, RECORDS, TRAJECTORY_INDICES, read_trajectory
+from analysis.records.run_files import CHECKPOINT, ENDS, RECORDS, TRAJECTORY_INDICES, read_trajectory
 from analysis.records.schema import Index
 from analysis.records.tables import bracketed
 from analysis.runs.options import TrajectoryOptions
@@ -86,10 +86,7 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
     together = pd.concat(tables, ignore_index=True)
     if set(together["state"]) == {"skipped"}:
         note = str(together["note"].iloc[-1]) if "note" in together else "why is not said"
-        remedy = "; train with a larger --probe-share" if note.startswith(NO_TIME) else ""
-        raise InputError(
-            f"expected at least one record that was not skipped, got {len(together)} skipped ({note}){remedy}"
-        )
+        raise InputError(f"expected at least one record that was not skipped, got {len(together)} skipped ({note})")
     return together
 
 

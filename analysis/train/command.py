@@ -134,7 +134,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         raise InputError(f"expected keep_checkpoints of at least 0, or all, got {options.keep_checkpoints}")
     if options.tensorboard:
         scalar_writer()  # refuses before anything is loaded
-    along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_share)
+    along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_quick)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
     plan, given = from_checkpoint(options, planned(options, out), out)
@@ -179,7 +179,7 @@ def _run(run: Run, options: TrainOptions, command: Sequence[str], along: Traject
         return code
     report(training, run.views, run.held_out, run.out, run.fingerprint)
     if trajectory:
-        say(*filter(None, (trajectory.thinned, trajectory.mixed)), style="yellow", console=console)
+        say(*filter(None, (trajectory.skipped, trajectory.mixed)), style="yellow", console=console)
     return 0
 
 

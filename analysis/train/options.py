@@ -73,5 +73,5 @@ class TrainOptions:
     """Also write them to OUT/tensorboard."""
     probe_every: int | None = None
     """Steps between records in OUT/trajectory.csv."""
-    probe_share: float = 0.1
-    """Their time over the steps', at most."""
+    probe_quick: bool = False
+    """Coarse ones, in a third of the time."""

@@ -9,16 +9,14 @@ on a CPU, from the diagonal block of every Gaussian, and sampled on a GPU.  Lanc
 an end.  Every record has a generator seeded by the run's seed and the step, so that records change no bit of the training and
 do not depend on each other.
 
-Time.  The first record, before the first step, and the last are always made.  All records together, with the least that the
-last will take, may take `share` of the seconds of the steps so far; what one record does not use is left to later ones.  A
-record is whole where that is expected to fit, else coarse, else skipped.  Its time is expected from the last records, at first
-from that of a gradient.  A record's numbers depend on the seed alone; with share = inf every record is whole.
+A record is made before the first step, every so many steps and after the last, all of one kind: whole, or coarse with
+--probe-quick, at a third of the time.
 
 Columns:
 
     step, gaussians        steps done, and Gaussians after them
     state, note            "whole"; "coarse": traces from a few samples, ends to 10% or COARSE_MATVECS products, no density;
-                           "skipped": nothing measured, for the reason in the note
+                           "skipped": nothing could be measured, for the reason in the note
     seconds, time_share    of the record; of all records so far over those of the steps so far
     visible_gaussians, parameters    Gaussians in sight, and active parameters
     matvecs                products H v of the record
@@ -31,16 +29,15 @@ Columns:
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from math import isinf
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
 
-from analysis.records.run_files import NO_TIME, RECORDS, read_trajectory
+from analysis.records.run_files import RECORDS, read_trajectory
 from landscape import (
     CountingOperator,
     EigenSettings,
@@ -70,20 +67,17 @@ from splat.training.state import Training
 
 START = "start"
 Row = dict[str, Any]
-Level = Literal["coarse", "whole"]
 FEWEST_OF_DENSITY = 16  # products
 COARSE_MATVECS = 24  # products of a coarse record's search for the ends
-# cost of a record, in gradients of all views
-TYPICAL = {"coarse": 20.0, "whole": 64.0}
 COLUMNS = (*MEASURED, *(f"of_{part}" for part in ("data", "question", "state", "formulas")))
 
 
 @dataclass(frozen=True)
 class TrajectorySettings:
-    """every: steps between records.  share: of the steps' time that records may take, inf for no limit.  traces: if sampled."""
+    """every: steps between records.  quick: coarse ones.  traces: if sampled."""
 
     every: int
-    share: float = 0.1
+    quick: bool = False
     traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=8))
     eigen: EigenSettings = field(default_factory=lambda: EigenSettings(rtol=1e-2, max_matvecs=150))
     density_matvecs: int = 32
@@ -91,8 +85,6 @@ class TrajectorySettings:
     def __post_init__(self) -> None:
         if self.every < 1:
             raise InputError(f"expected probe_every of at least 1 step, got {self.every}")
-        if not self.share > 0:
-            raise InputError(f"expected probe_share above 0 (0.1: a tenth of the time of the steps), got {self.share}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,40 +114,27 @@ class Trajectory:
     ) -> None:
         self.run, self.training, self.views, self.settings, self.reference = run, training, views, settings, reference
         self.rows = _read_rows(run / RECORDS, training.step)
-        self.taken: dict[Level, tuple[float, int]] = {}  # seconds of the last record, with how many Gaussians
-        self.pace = _compile(training, views)
+        _compile(training, views, settings)
 
     def before_steps(self) -> None:
-        """Record the start, whole where it is expected to take at most half of all records' time."""
+        """Record the start."""
         if self.training.step == 0 and not self.rows:
-            self._record(self.settings.share * self.pace * self.training.config.iterations / 2, 0.0)
+            self._record(0.0)
 
     def after_step(self, trained: float) -> None:
         """Record every so many steps and after the last.  trained: seconds of the steps so far."""
-        step, last = self.training.step, self.training.config.iterations
-        if step % self.settings.every and step != last:
-            return
-        self.pace = trained / step
-        left = self.settings.share * trained - sum(row["seconds"] for row in self.rows)
-        self._record(left if step == last else left - self._expected("coarse"), trained)
+        if self.training.step % self.settings.every == 0 or self.training.step == self.training.config.iterations:
+            self._record(trained)
 
-    def _record(self, allowed: float, trained: float) -> None:
+    def _record(self, trained: float) -> None:
         """Add a row and write all."""
-        step, spent = self.training.step, sum(row["seconds"] for row in self.rows)
-        row: Row = {"step": step, "gaussians": len(self.training.gaussians), "state": "skipped", "seconds": 0.0}
-        always, least = step in (0, self.training.config.iterations), self._expected("coarse")
-        if not always and allowed < least:
-            row["note"] = f"{NO_TIME}: {least:.2g} s were needed at least, {max(allowed, 0.0):.2g} s were allowed"
-        else:
-            level: Level = "whole" if self._expected("whole") <= allowed else "coarse"
-            start = perf_counter()
-            try:
-                row |= self._measured(level)
-            except InputError as error:  # such as no Gaussian in sight: the training may recover
-                row["note"] = str(error)
-            row["seconds"] = perf_counter() - start
-            if row["state"] == level:
-                self.taken[level] = row["seconds"], len(self.training.gaussians)
+        spent, start = sum(row["seconds"] for row in self.rows), perf_counter()
+        row: Row = {"step": self.training.step, "gaussians": len(self.training.gaussians), "state": "skipped"}
+        try:
+            row |= self._measured()
+        except InputError as error:  # such as no Gaussian in sight: the training may recover
+            row["note"] = str(error)
+        row["seconds"] = perf_counter() - start
         row["time_share"] = (spent + row["seconds"]) / trained if trained else None
         row |= self._about()
         self.rows.append(row)
@@ -164,16 +143,10 @@ class Trajectory:
         write_atomically(self.run / RECORDS, table.to_csv(index=False).encode())
 
     @property
-    def thinned(self) -> str:
-        """Sentence on records that were skipped or coarse, and what to do; empty where all are whole."""
-        counts = {state: sum(row["state"] == state for row in self.rows) for state in ("skipped", "coarse")}
-        said = " and ".join(f"{count} {state}" for state, count in counts.items() if count)
-        if not said:
-            return ""
-        others = [row["note"] for row in self.rows if row["state"] == "skipped" and not row["note"].startswith(NO_TIME)]
-        why = others[-1] if others else f"they may take {self.settings.share:g} of the time of the steps"
-        remedy = "" if others else "; --probe-share inf sets no limit to their time"
-        return f"of {len(self.rows)} records of the landscape, {said} ({why}){remedy}"
+    def skipped(self) -> str:
+        """Sentence on records of which nothing could be measured, with the last reason; empty without any."""
+        notes = [row["note"] for row in self.rows if row["state"] == "skipped"]
+        return f"of {len(self.rows)} records of the landscape {len(notes)} are empty: {notes[-1]}" if notes else ""
 
     @property
     def mixed(self) -> str:
@@ -186,26 +159,16 @@ class Trajectory:
         return f"records of step {steps} are of other views, settings or formulas than today's, and do not compare"
 
     def _about(self) -> Row:
-        settings = asdict(replace(self.settings, every=1, share=1.0))  # which change no number
+        settings = asdict(replace(self.settings, every=1))  # which changes no number
         made = Checkpoint(self.training, self.reference).fingerprint(settings, self.training.config.seed)
         return {f"of_{name}": value for name, value in made.digests.items()}
 
-    def _expected(self, level: Level) -> float:
-        """Expected seconds of a record: from the last ones, else from the time of a step."""
-        if isinf(self.settings.share):
-            return 0.0
-        for known in (level, *TYPICAL):
-            if known in self.taken:
-                seconds, gaussians = self.taken[known]
-                return seconds * TYPICAL[level] / TYPICAL[known] * len(self.training.gaussians) / gaussians
-        return TYPICAL[level] * len(self.views) * self.pace
-
-    def _measured(self, level: Level) -> Row:
+    def _measured(self) -> Row:
         objective = self.training.config.objective(self.training.gaussians, self.views)
-        found = measure(objective, self._generator(), self.settings, level)
+        found = measure(objective, self._generator(), self.settings)
         counts = objective.counts
         return {
-            "state": level,
+            "state": "coarse" if self.settings.quick else "whole",
             "note": "",
             "visible_gaussians": counts.active_gaussians,
             "parameters": counts.active_parameters,
@@ -219,12 +182,10 @@ class Trajectory:
         return torch.Generator(device).manual_seed(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))
 
 
-def measure(
-    objective: SceneObjective, generator: torch.Generator, settings: TrajectorySettings, level: Level = "whole"
-) -> Found:
+def measure(objective: SceneObjective, generator: torch.Generator, settings: TrajectorySettings) -> Found:
     """One record."""
     streams = [spawn(generator) for _ in range(3)]
-    hessian, whole = SceneHessian(objective), level == "whole"
+    hessian, whole = SceneHessian(objective), not settings.quick
     operator = CountingOperator(hessian)
     if whole and objective.active.flat.device.type == "cpu":
         traces = block_traces(objective)
@@ -272,13 +233,9 @@ def _read_rows(path: Path, step: int) -> list[Row]:
     return [row | {"seconds": float(seconds)} for row, at, seconds in kept if at <= step]
 
 
-def _compile(training: Training, views: Sequence[View]) -> float:
-    """Compile a record's kernels, on a few Gaussians, outside its measured time; returns seconds of a view's gradient."""
-    objective = training.config.objective(training.gaussians, views)
-    few = training.config.objective(training.gaussians.select(objective.mask.nonzero()[:8, 0]), views)
-    least = TrajectorySettings(1, eigen=EigenSettings(max_matvecs=10), density_matvecs=FEWEST_OF_DENSITY)
-    for level in get_args(Level):
-        measure(few, torch.Generator(training.gaussians.flat.device).manual_seed(0), least, level)
-    start = perf_counter()
-    objective.gradient  # noqa: B018 (computed to be timed)
-    return (perf_counter() - start) / len(views)
+def _compile(training: Training, views: Sequence[View], settings: TrajectorySettings) -> None:
+    """Compile a record's kernels, on a few Gaussians, outside its measured time."""
+    seen = training.config.objective(training.gaussians, views).mask.nonzero()[:8, 0]
+    few = training.config.objective(training.gaussians.select(seen), views)
+    least = replace(settings, eigen=EigenSettings(max_matvecs=10), density_matvecs=FEWEST_OF_DENSITY)
+    measure(few, torch.Generator(training.gaussians.flat.device).manual_seed(0), least)

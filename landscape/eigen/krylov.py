@@ -31,7 +31,7 @@ from landscape.eigen.pairs import EigenEnds, Eigenpairs
 from landscape.eigen.ritz import EigenSettings, Goal, Ritz, rayleigh, recombine, turned
 from landscape.linalg import is_roundoff, norm, orthogonalise, unit_columns
 from landscape.operators.checks import SCALE
-from landscape.operators.operator import SymmetricOperator, product, require_finite
+from landscape.operators.operator import LiftedOperator, SymmetricOperator, product, require_finite
 from landscape.probes import draw_probes
 from landscape.results import StopReason
 
@@ -64,6 +64,8 @@ class Krylov:
         if start is not None:
             first[:, 0] = _mixed(start, first[:, 0], settings.noise)
             self.random_share = settings.noise / (1 + settings.noise)
+        if isinstance(operator, LiftedOperator):  # without a part in the null space, up to round-off
+            first = operator.project(first)
         self.append(first.T.contiguous())
         self.predicted = torch.zeros(0, self.width, dtype=torch.float64)
         self.predictions, self.mismatch = 0, 0.0
@@ -200,7 +202,7 @@ class Krylov:
         # a residual far above that of the recurrence is noise of the matvec: more steps cannot lower it
         stuck = (known <= residuals / 4) | (known <= self.floor(ritz))
         reached = residuals <= Goal(s.rtol, s.atol).of(values)
-        errors = residuals / ritz.gaps()
+        errors = residuals / ritz.gaps()[ritz.wanted]
 
         def end(part: slice, descending: bool) -> Eigenpairs:
             reason: StopReason = budget
@@ -217,8 +219,20 @@ class Krylov:
         noise = self.seen_noise if isnan(self.noise) else self.noise
         spread = float(ritz.values[-1] - ritz.values[0])
         beyond = _beyond(self.operator.dim, self.first_cycle, spread, self.random_share)
-        ends = EigenEnds(largest, smallest, "lanczos", self.matvecs, beyond, noise, spectrum)
+        further = self._further(ritz) if s.further else None
+        ends = EigenEnds(largest, smallest, "lanczos", self.matvecs, beyond, noise, spectrum, further)
         return ends, not bool((reached | stuck).all())
+
+    def _further(self, ritz: Ritz) -> tuple[Eigenpairs, Eigenpairs]:
+        """The pairs next to those wanted at either end, as they are."""
+        s, order, found = self.settings, range(len(ritz.values)), []
+        for chosen in (order[::-1][s.largest :], order[s.smallest :]):
+            some = list(chosen[: min(s.further, max(len(order) - s.wanted, 0) // 2)])
+            vectors = self.basis[: self.size].T @ ritz.coordinates[:, some].to(self.basis)
+            residuals = ritz.residuals[some]
+            errors = residuals / ritz.gaps()[some]
+            found.append(Eigenpairs(ritz.values[some], turned(vectors), residuals, errors, "not asked for"))
+        return found[0], found[1]
 
     def _checked(
         self, ritz: Ritz, vectors: Float[Tensor, "n k"], converged: bool

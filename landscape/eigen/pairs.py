@@ -54,6 +54,7 @@ class EigenEnds:
         A worst-case bound over all spectra, far from sharp; infinite where there is none.
     noise: length of the error (round-off or other) of H v for a unit vector v: measured by a product if a residual came near
         it, else estimated from the asymmetry of products, else nan.
+    further: pairs next to those of either end, with the residuals that the search left them; None where not asked for.
     ritz: first row: all approximate eigenvalues of the last basis, ascending; second row: estimates of their residuals.  None
         for a method without a basis.
     """
@@ -65,6 +66,7 @@ class EigenEnds:
     beyond: float
     noise: float
     ritz: Float64[Tensor, "2 m"] | None = None
+    further: tuple[Eigenpairs, Eigenpairs] | None = None
 
     def __repr__(self) -> str:
         return f"largest   {self.largest!r}\nsmallest  {self.smallest!r}\n  by {self.method}, {self.matvecs} products"

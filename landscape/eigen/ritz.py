@@ -26,6 +26,7 @@ class EigenSettings:
     """Number of pairs at each end, their residual, and limits of memory and work.
 
     largest, smallest: numbers of pairs of the largest and of the smallest (signed) eigenvalues.
+    further: so many pairs next to these at either end are returned too, as they are found, without a goal.
     rtol, atol: a pair is done when its residual |H v - lambda v| is at most max(rtol |lambda|, atol).
     basis: memory budget in vectors, with `block` more in work: at least largest + smallest + 3 block.
     block: vectors in one application of the operator.  More than one helps with multiple eigenvalues, and where products with
@@ -45,6 +46,7 @@ class EigenSettings:
     noise: float = 1.0
     max_matvecs: int = 1000
     max_seconds: float = inf
+    further: int = 0
 
     def __post_init__(self) -> None:
         if min(self.largest, self.smallest) < 0 or self.wanted < 1 or self.block < 1:
@@ -107,10 +109,10 @@ class Ritz:
         limit = min(NEAR * noise, NEAREST * float(self.values.abs().max()))
         return any(float(self.residuals[i]) < limit for i in self.open(goal))
 
-    def gaps(self) -> Float64[Tensor, " k"]:
-        """Distance from each wanted value to the nearest other one."""
+    def gaps(self) -> Float64[Tensor, " m"]:
+        """Distance from each value to the nearest other one."""
         steps = torch.diff(self.values, prepend=torch.tensor([-inf]), append=torch.tensor([inf]))
-        return torch.minimum(steps[:-1], steps[1:])[self.wanted]
+        return torch.minimum(steps[:-1], steps[1:])
 
     def state(self) -> str:
         parts = [

@@ -224,6 +224,30 @@ class ProjectedOperator:
         return self.project(self.inner.apply(self.project(V)))
 
 
+class LiftedOperator:
+    """P H P + c (1 - P) for an operator that is P H P, and a Rayleigh quotient c of it.
+
+    c lies between the smallest and the largest eigenvalue of P H P: the null space that P leaves out is at neither end.
+
+    >>> H, P = DenseOperator(torch.diag(torch.tensor([2.0, 1.0, 0.0]))), torch.diag(torch.tensor([1.0, 1.0, 0.0]))
+    >>> lifted = LiftedOperator(H, lambda V: P @ V, torch.Generator().manual_seed(0))
+    >>> 1 < float(lifted.apply(torch.eye(3))[2, 2]) < 2
+    True
+    """
+
+    def __init__(
+        self, inner: SymmetricOperator, project: Callable[[Tensor], Tensor], generator: torch.Generator
+    ) -> None:
+        self.inner, self.project = inner, project
+        self.dim, self.dtype, self.blocks = inner.dim, inner.dtype, inner.blocks
+        v = project(torch.randn(inner.dim, 1, generator=generator, dtype=inner.dtype, device=generator.device))
+        self.level = float((v * inner.apply(v)).sum() / v.square().sum())
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        require_vectors(V, self.dim, self.dtype)
+        return self.inner.apply(V).add_(V - self.project(V), alpha=self.level)
+
+
 class CountingOperator:
     """H, with counts of its use so far.
 

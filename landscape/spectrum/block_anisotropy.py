@@ -16,7 +16,7 @@ from torch import Tensor
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
-from landscape.operators.operator import RestrictedOperator, SymmetricOperator
+from landscape.operators.operator import LiftedOperator, ProjectedOperator, RestrictedOperator, SymmetricOperator
 from landscape.probes import spawn
 from landscape.results import Progress, ShortRepr
 from landscape.spectrum.anisotropy import Anisotropy, anisotropy
@@ -120,7 +120,9 @@ def block_anisotropy(
     """The family of one operator; active: what its known null space leaves; lead: what is known beforehand."""
     rank = operator.dim if active is None else active.rank
     eigen = settings.eigen if rank >= settings.eigen.wanted else EigenSettings(1, 0, rtol=settings.eigen.rtol)
-    search = operator if active is None else _Lifted(operator, active, spawn(generator))
+    search = operator
+    if active is not None:
+        search = LiftedOperator(ProjectedOperator(operator, active.project), active.project, spawn(generator))
     ends = extreme_eigenpairs(search, generator, eigen, lead.start, progress)
     if eigen.smallest == 0:  # one direction: both ends are the same
         ends = EigenEnds(ends.largest, ends.largest, ends.method, ends.matvecs, ends.beyond, ends.noise, ends.ritz)
@@ -130,23 +132,6 @@ def block_anisotropy(
         batch=batch, progress=progress, active=active, ends=ends, trace=lead.trace,
     )  # fmt: skip
     return BlockAnisotropy(rank, ends, density, anisotropy(ends, density))
-
-
-class _Lifted:
-    """P H P + c (1 - P), for the projector P onto what a known null space leaves and a Rayleigh quotient c of P H P.
-
-    The eigenvalue of the null space, c, lies between the smallest and the largest one of the rest: both ends are of the rest.
-    """
-
-    def __init__(self, inner: SymmetricOperator, active: ActiveSpace, generator: torch.Generator) -> None:
-        self.inner, self.project = inner, active.project
-        self.dim, self.dtype, self.blocks = inner.dim, inner.dtype, inner.blocks
-        v = active.project(torch.randn(inner.dim, 1, generator=generator, dtype=inner.dtype, device=generator.device))
-        self.level = float((v * inner.apply(v)).sum() / v.square().sum())
-
-    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        left = self.project(V)
-        return self.project(self.inner.apply(left)) + self.level * (V - left)
 
 
 def _named(progress: Progress | None, name: str) -> Progress | None:

@@ -31,8 +31,7 @@ from analysis.commands.uses.next_view import informations, picked
 from analysis.console.plain import say
 from analysis.records.json_files import json_text, read_json
 from analysis.records.schema import Count
-from figures.style import literal, new_figure, save, style
-from figures.uses import RULES as LOOKS
+from figures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, literal, new_figure, save, style
 from landscape.errors import InputError
 from splat.curvature.scores.information import GAINS
 from splat.model.untrusted import read_toml, require_name, write_atomically
@@ -46,6 +45,15 @@ from splat.training.start import initial_gaussians
 from splat.training.state import TrainConfig, Training
 
 RULES = (*GAINS, "uniform", "random")
+LOOKS = {
+    "d": ("D-optimal, blocks", BLUE),
+    "t": ("T-optimal, blocks", SKY),
+    "e": ("E-optimal, blocks", PURPLE),
+    "d_diagonal": ("D-optimal, diagonal", GREEN),
+    "published": ("FisherRF's diagonal", VERMILION),
+    "uniform": ("uniform", BLACK),
+    "random": ("random", ORANGE),
+}
 
 
 class StudyScene(msgspec.Struct, forbid_unknown_fields=True):

@@ -18,7 +18,7 @@ from analysis.records.quantities import exponent_of
 from figures import make_all, slice2d, spectrum, surface, traces
 from figures.plane import plane
 from figures.render_surface import Box
-from figures.style import BLACK, COLUMN, SKY, save, style
+from figures.style import BLACK, COLUMN, save, style
 from landscape.errors import TooLittleMemory
 from tests.recorded import synthetic, written
 from tests.refusals import refused
@@ -177,7 +177,7 @@ def test_the_numbers_along_the_steps_stay_apart(tmp_path, reach):
 def test_the_first_direction_runs_to_the_right(tmp_path):
     data, arrays = synthetic()
     arrays["slice"]["loss"] = data["slice"]["center_loss"] + np.add.outer(np.arange(21.0), np.zeros(17))
-    arrays["slice"]["crossed"] = np.arange(21)[:, None] * np.ones(17) > 15
+    arrays["slice"]["evaluated"] = np.arange(21)[:, None] * np.ones(17) > 15
     axes = slice2d.draw(written(tmp_path / "probe", data, arrays)).axes[0]
     (dots,) = [line for line in axes.lines if len(np.asarray(line.get_xdata())) == 5 * 17]
     assert np.min(np.asarray(dots.get_xdata())) > 0.4 * axes.get_xlim()[1]
@@ -191,29 +191,34 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     data["slice"]["interpolation_error"] = 0.004
     record = written(tmp_path / "probe", data, arrays)
     figure = slice2d.draw(record)
-    drawn = [line for line in figure.axes[0].lines if line.get_marker() == "."]
-    dots = {line.get_color(): len(np.asarray(line.get_xdata())) for line in drawn}
-    assert dots == {BLACK: 3 * 5, SKY: 2 * 5}
+    dots = {
+        line.get_color(): len(np.asarray(line.get_xdata())) for line in figure.axes[0].lines if line.get_marker() == "."
+    }
+    assert dots == {slice2d.FAINT["color"]: 5 * 5}
     said = " ".join(text for text, _ in words(figure, laid_out(figure)))
-    assert "dots: rendered (7%),\nline: interpolated (error <0.4%)" in said and "order changed:\n10 of 25" in said
+    assert "plane: 7% rendered,\nelse interpolated (error <0.4%)" in said and "order changed:\n10 of 25" in said
     sections = [axes for axes in figure.axes if "step along" in axes.get_xlabel()]
     along = [[len(np.asarray(x.get_xdata())) for x in axes.lines if x.get_marker() == "."] for axes in sections]
     assert [3, 2] in along  # the crossed ones apart
 
 
-LOWEST = [((10, 8), "lowest at the checkpoint, the cross"), ((4, 2), "down by at most 0.500, at (")]
-
-
-@pytest.mark.parametrize(("lowest", "said"), LOWEST)
-def test_the_title_of_a_plane_says_where_it_is_lowest(tmp_path, lowest, said):
+@pytest.mark.parametrize(
+    ("ratio", "said"),
+    [
+        (1.1, "changes as its curvature says"),
+        (0.14, "rises, 0.14 of what its curvature says"),
+        (-2.0, "falls, against its curvature"),
+    ],
+)
+def test_a_section_is_headed_by_how_far_its_curvature_holds(tmp_path, ratio, said):
+    """With a slope, which cancels in the mean of both ends."""
     data, arrays = synthetic()
-    loss = np.full((21, 17), data["slice"]["center_loss"])
-    loss[0, 0], loss[lowest] = loss[0, 0] + 2.0, loss[lowest] - 0.5
-    loss[10, 8] = data["slice"]["center_loss"] - 0.01 * (lowest == (10, 8))
-    arrays["slice"]["loss"] = loss
+    steps = np.linspace(-1, 1, 21)[:, None] * np.ones(17)
+    arrays["slice"]["model"] = data["slice"]["center_loss"] + steps + 2 * steps**2
+    arrays["slice"]["loss"] = data["slice"]["center_loss"] + steps + 2 * ratio * steps**2
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
-    title = figure.axes[0].get_title(loc="left").replace("\n", " ")
-    assert title.startswith("In this plane: up by at most 2.00, ") and said in title
+    titles = [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes]
+    assert f"Along {data['slice']['directions'][0]['name']} the loss {said}" in titles
     require_layout(figure)
 
 

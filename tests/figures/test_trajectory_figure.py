@@ -57,65 +57,61 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
     table = gathered([run(tmp_path / "a"), run(tmp_path / "b", 3.0)])
     figure = trajectory.draw(table)
     panels = {axes.get_title(): axes for axes in figure.axes}
+    assert all(axes.get_yscale() == "log" for axes in panels.values())
     for name, colour, scale in (("a", RUNS[0], 1.0), ("b", RUNS[1], 3.0)):
-        (line,) = [x for x in panels["trace of position"].lines if to_hex(x.get_color()).upper() == colour]
-        assert list(np.asarray(line.get_xdata())) == [1000, 1500, 2000], name  # the skipped record is left out
-        assert np.asarray(line.get_ydata()) == pytest.approx([scale * (i - 2.5) for i in (2, 3, 4)])
-    eigenvalue_ratio = panels["|λmax / λmin|"]
-    hollow = [
-        x for x in eigenvalue_ratio.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) == "#ffffff"
+        lines = [x for x in panels["trace of position"].lines if to_hex(x.get_color()).upper() == colour]
+        assert list(np.asarray(lines[0].get_xdata())) == [1000, 1500, 2000], name  # the skipped record is left out
+        assert np.asarray(lines[0].get_ydata()) == pytest.approx([scale * abs(i - 2.5) for i in (2, 3, 4)])
+    smallest = panels["smallest eigenvalue"]
+    hollow = [x for x in smallest.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) == "#ffffff"]
+    assert [float(y) for x in hollow for y in np.asarray(x.get_ydata())] == pytest.approx(
+        [1 / 2, 1 / 3, 1 / 4, 3 / 2, 1, 3 / 4]
+    )
+    assert list(np.asarray(panels["Gaussians"].lines[0].get_ydata())) == [2000, 3000, 4000]
+    assert "a: λ max × 2.0 from step 1,000 to 2,000" in figure.get_suptitle()
+
+
+def test_a_bound_is_an_arrow_without_a_line(tmp_path):
+    axes = {each.get_title(): each for each in trajectory.draw(gathered([run(tmp_path / "a")])).axes}[
+        "participation ratio"
     ]
-    assert [float(y) for x in hollow for y in np.asarray(x.get_ydata())] == [4.0, 9.0, 16.0] * 2
-    assert eigenvalue_ratio.get_yscale() == "log" and panels["trace of log scale"].get_yscale() == "log"
-    bounds = [
-        x for x in panels["participation ratio"].lines if x.get_marker() == "^" and len(np.asarray(x.get_xdata()))
-    ]
-    assert [float(y) for x in bounds for y in np.asarray(x.get_ydata())] == [10.0, 15.0, 20.0] * 2
-    gaussians = panels["Gaussians"].lines[0]
-    assert list(np.asarray(gaussians.get_ydata())) == [1000, 2000, 3000, 4000]
+    arrows = [x for x in axes.lines if x.get_marker() == trajectory.ARROW["marker"]]
+    assert [float(y) for x in arrows for y in np.asarray(x.get_ydata())] == [10.0, 15.0, 20.0]
+    lines = [x for x in axes.lines if x.get_linestyle() == "-"]
+    assert lines and not np.isfinite(np.concatenate([np.asarray(x.get_ydata(), float) for x in lines])).any()
+    assert all(x.get_linestyle() == "None" for x in arrows)
 
 
 def test_an_index_that_coarse_records_lack_is_said_to_be_so():
     coarse = rows().assign(run="a", participation_ratio=math.nan, participation_ratio_low=math.nan)
     panels = {axes.get_title(): axes for axes in trajectory.draw(coarse).axes}
     assert [text.get_text() for text in panels["participation ratio"].texts] == ["not measured"]
-    assert not panels["participation ratio"].get_xticks().size and not panels["|λmax / λmin|"].texts
+    assert not panels["participation ratio"].get_xticks().size and not panels["largest eigenvalue"].texts
 
 
 def test_ticks_are_at_steps_such_as_are_recorded():
     assert list(trajectory.step_ticks().tick_values(90, 310)) == [0, 100, 200, 300, 400]
 
 
-def test_every_point_stands_at_its_step_and_the_band_is_its_bracket():
+def test_every_point_stands_at_its_step_and_the_band_is_its_interval():
     table = rows().assign(run="a")
-    axes = {each.get_title(): each for each in trajectory.draw(table).axes}["|λmax / λmin|"]
+    axes = {each.get_title(): each for each in trajectory.draw(table).axes}["largest eigenvalue"]
     (line,) = [x for x in axes.lines if x.get_linestyle() == "-"]
     measured = table[table["state"] != "skipped"]
     assert list(np.asarray(line.get_xdata())) == list(measured["step"])
-    assert np.array_equal(line.get_transform().transform((1000, 4.0)), axes.transData.transform((1000, 4.0)))
     corners = np.asarray(axes.collections[0].get_paths()[0].vertices)
-    ends = np.abs(np.asarray(measured[["eigenvalue_ratio_low", "eigenvalue_ratio_high"]], float))
-    assert corners[:, 1].min() == pytest.approx(ends.min()) and corners[:, 1].max() == pytest.approx(ends.max())
+    assert corners[:, 1].min() == pytest.approx(1.9) and corners[:, 1].max() == pytest.approx(4.1)
 
 
-def test_powers_of_ten_have_a_line_and_the_legend_says_what_is_open():
+def test_the_legend_says_what_is_open_and_what_an_arrow_is():
     figure = trajectory.draw(rows(1e-4).assign(run="a"))
-    titles = [axes.get_title() for axes in figure.axes]
-    assert "smallest eigenvalue\n(×10⁻⁶)" in titles and "largest eigenvalue\n(×10⁻⁶)" in titles
-    said = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert said == ["a", "open: the index is negative", "triangle: at least so large", UNITS]
+    said = ["a", "open: the number is negative", "arrow: at least so large", UNITS]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == said
     positive = rows().assign(run="a")
-    positive["eigenvalue_ratio"] = positive["eigenvalue_ratio"].abs()
+    for name in ("lambda_min", "trace_means", "trace_quats"):
+        positive[name] = positive[name].abs()
     positive["participation_ratio_high"] = 2 * positive["participation_ratio"]
     assert [text.get_text() for text in trajectory.draw(positive).legends[0].get_texts()] == ["a", UNITS]
-
-
-def test_of_an_index_without_any_bound_nothing_is_drawn(tmp_path):
-    table = rows().assign(run="a")
-    table.loc[2, ["eigenvalue_ratio_low", "eigenvalue_ratio_high"]] = 0.0, math.nan
-    panels = {axes.get_title(): axes for axes in trajectory.draw(table).axes}
-    drawn = [float(y) for x in panels["|λmax / λmin|"].lines for y in np.asarray(x.get_ydata())]
-    assert 9.0 not in drawn and {4.0, 16.0} <= set(drawn)
 
 
 def test_the_command_prints_first_and_last_values_and_writes_the_files(tmp_path, capsys, monkeypatch):
@@ -156,15 +152,13 @@ def test_a_figures_script_given_something_else_says_what_it_expects(tmp_path, mo
 def test_a_run_without_records_or_named_twice_is_refused_with_what_to_do(tmp_path, capsys):
     kept = run(tmp_path / "kept")
     (tmp_path / "bare").mkdir()
-    for name, note in (("brief", "no time: 9 s were needed"), ("blind", "no Gaussian touches a pixel")):
-        run(tmp_path / name)
-        rows()[:1].assign(note=note).to_csv(tmp_path / name / "trajectory.csv", index=False)
+    run(tmp_path / "blind")
+    rows()[:1].assign(note="no Gaussian touches a pixel").to_csv(tmp_path / "blind" / "trajectory.csv", index=False)
     (run(tmp_path / "empty") / "trajectory.csv").write_text("")
     for runs, told in (
         ([kept, tmp_path / "bare"], "train with --probe-every"),
         ([kept, kept], "every run once"),
         ([kept, tmp_path / "gone"], f"{tmp_path / 'gone'} does not exist"),
-        ([tmp_path / "brief"], "got 1 skipped (no time: 9 s were needed); train with a larger --probe-share"),
         ([tmp_path / "blind"], "got 1 skipped (no Gaussian touches a pixel)"),
         ([tmp_path / "empty"], f"in {tmp_path / 'empty' / 'trajectory.csv'}, got"),
     ):
@@ -172,5 +166,5 @@ def test_a_run_without_records_or_named_twice_is_refused_with_what_to_do(tmp_pat
         said = capsys.readouterr().err
         assert said.startswith("landscape: expected") and told in said
     table = gathered([kept])
-    with pytest.raises(ValueError, match="larger --probe-share"):
+    with pytest.raises(ValueError, match="expected at least one record"):
         trajectory.draw(pd.DataFrame(table[table["state"] == "skipped"]))

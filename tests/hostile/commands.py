@@ -238,7 +238,7 @@ class Trajectory(Files):
         super().made_before()
         out, steps = ["--out", str(self.checkpoint.parent)], ["--iterations", "4", "--probe-every", "2"]
         shutil.rmtree(self.checkpoint.parent)
-        train = ["train", str(self.scene), *out, *steps, "--probe-share", "inf"]
+        train = ["train", str(self.scene), *out, *steps]
         assert forked(lambda: cli.main(train)).wait() == 0
 
     def words(self) -> list[str]:

@@ -60,7 +60,7 @@ class Model(Format):
 
     def use(self) -> None:
         listed = self.root / LIST if LIST in self.beside else None
-        ask = Foreign(trained_by=self.trained_by, scene=self.root / "scene", train_list=listed)
+        ask = Foreign(trained_by=self.trained_by, scene=self.root / "scene", train_list=listed, guess_views=True)
         subject = open_subject(self.root / self.file, ask)
         flat, names = subject.checkpoint.training.gaussians.flat, subject.checkpoint.scene.train
         assert torch.isfinite(flat).all() and set(names) <= {*subject.scene.names}, "a scene that cannot be"

@@ -1,8 +1,17 @@
 """`landscape next-view`: what each candidate camera would tell about a scene (`splat.curvature.scores.information`).
 
-gains.csv       every gain of every candidate over the training views alone, and `pick`: 1 for the first that is chosen by
-                --by, 2 for the next when that one has been added, ...; gains.png
+gains.csv       every gain of every candidate over the training views alone; `behind`: by how much that of --by is smaller than
+                the best one's, and `error`, its standard error, as if the Gaussians were a sample; three rules that ask for no
+                curvature; `pick`: 1 for the first that is chosen by --by, 2 for the next when that one has been added, ...
+                gains.png
 next-view.json  where it comes from
+
+The error is that of a sum over Gaussians drawn independently: neighbours are alike, so it is the least that another training of
+the same views would change.  Candidates that are behind by at most TWICE the error are called equal.
+
+coverage        the Gaussians that the camera sees, each over one more than the number of training views that see it
+farthest        the distance of the camera from the nearest training view, world units
+uniform         the places between the camera and the nearest training view in the order of the capture
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from analysis.commands.uses.options import NextViewOptions
+from analysis.commands.uses.options import GEOMETRY, NextViewOptions
 from analysis.console.drawing import draw_or_say
 from analysis.console.plain import say
 from analysis.console.stages import Stages
@@ -24,7 +33,7 @@ from analysis.records.provenance import provenance_of
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
-from splat.curvature.scores.information import GAINS, Information, gains, information, prior_of
+from splat.curvature.scores.information import GAINS, Information, gains, gains_of_each, information, prior_of
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -34,6 +43,7 @@ from splat.training.origin.scene_reference import data_of
 from splat.training.origin.subject import Checkpoint
 
 RECORD = "next-view.json"  # the file by which a folder of results is known
+TWICE = 2.0  # errors
 
 
 def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
@@ -57,7 +67,8 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
             known = informations(checkpoint.training.gaussians, cameras, background, config.render, report)
         with stages.stage("gains"):
             seen = [known[name] for name in checkpoint.scene.train]
-            table = pd.DataFrame({name: gains_over(seen, [], known[name]) for name in candidates}).T
+            table = judged_alone(seen, {name: known[name] for name in candidates}, options.by)
+            table = table.join(geometry(checkpoint.scene.train, candidates, known, scene))
             table.index.name = "view"
             for place, name in enumerate(picked(seen, known, candidates, options.take, options.by)):
                 table.loc[name, "pick"] = place + 1
@@ -118,13 +129,49 @@ def picked(
     return chosen
 
 
+def judged_alone(seen: Sequence[Information], candidates: Mapping[str, Information], by: str) -> pd.DataFrame:
+    """Gains over the training views alone, a row for each candidate, and how far it is behind the best, with the error."""
+    total = sum(seen[1:], seen[0])
+    parts = {name: gains_of_each(total, prior_of(total), each) for name, each in candidates.items()}
+    best = max((each[by] for each in parts.values()), key=lambda part: float(part.sum()))
+    rows = {}
+    for name, each in parts.items():
+        behind = best - each[by]
+        error = float(behind.std() * len(behind) ** 0.5)
+        rows[name] = {gain: float(part.sum()) for gain, part in each.items()} | {
+            "behind": float(behind.sum()),
+            "error": error,
+        }
+    return pd.DataFrame(rows).T
+
+
+def geometry(
+    train: Sequence[str], candidates: Sequence[str], known: Mapping[str, Information], scene: Scene
+) -> pd.DataFrame:
+    """What three rules that ask for no curvature say of each candidate."""
+    sees = {name: known[name].diagonal.sum(dim=1) > 0 for name in (*train, *candidates)}
+    views = torch.stack([sees[name] for name in train]).sum(dim=0)
+    centres = {frame.name: frame.camera.centre for frame in scene.frames}
+    rows = {}
+    for name in candidates:
+        far = min(float((centres[name] - centres[other]).norm()) for other in train)
+        places = min(abs(scene.names.index(name) - scene.names.index(other)) for other in train)
+        rows[name] = {"coverage": float((sees[name] / (1 + views)).sum()), "farthest": far, "uniform": float(places)}
+    return pd.DataFrame(rows).T
+
+
 def _conclude(table: pd.DataFrame, options: NextViewOptions, out: Path) -> None:
-    console, shown = Console(), Table(caption="gains over the training views; picks: each knows those before it")
-    for title in ("view", *GAINS, "pick"):
+    console, shown = Console(), Table(caption=f"behind: the best by {options.by} ± its error over Gaussians")
+    columns = (options.by, *GEOMETRY)
+    for title in ("view", *columns, "behind", "pick"):
         shown.add_column(title, justify="left" if title == "view" else "right")
     for row in table.reset_index().to_dict("records"):
-        pick = f"{row['pick']:.0f}" if row["pick"] > 0 else ""
-        shown.add_row(row["view"], *(f"{row[gain]:.4g}" for gain in GAINS), pick)
+        pick, behind = f"{row['pick']:.0f}" if row["pick"] > 0 else "", f"{row['behind']:.2g} ± {row['error']:.1g}"
+        shown.add_row(row["view"], *(f"{row[name]:.3g}" for name in columns), behind, pick)
     console.print(shown)
-    names = ", ".join(table.index[table.pick.notna()])
-    say(f"next, by {options.by}: {names}", f"gains.csv, gains.png in {out}", console=console)
+    names, equal = ", ".join(table.index[table.pick.notna()]), [*table.index[table.behind <= TWICE * table.error]]
+    say(f"next, by {options.by}: {names}", console=console)
+    if len(equal) > 1:
+        say(f"the first {len(equal)} are equal within twice their error: {', '.join(equal)}", console=console)
+    best = "; ".join(f"by {rule}: {table[rule].idxmax()}" for rule in GEOMETRY)
+    say(f"without curvature {best}", f"gains.csv, gains.png in {out}", console=console)

@@ -9,6 +9,8 @@ from tyro.conf import Positional, UseAppendAction, arg
 from analysis.console.options import CheckpointPath, OtherTools
 from splat.training.origin.options import Foreign
 
+GEOMETRY = ("coverage", "farthest", "uniform")  # rules of next-view that ask for no curvature
+
 
 @dataclass(frozen=True)
 class PruneOptions:

@@ -86,17 +86,21 @@ def prior_of(seen: Information) -> Information:
 
 def gains(seen: Information, prior: Information, candidate: Information) -> dict[str, float]:
     """Gain of a candidate over the views seen, by every criterion."""
+    return {name: float(each.sum()) for name, each in gains_of_each(seen, prior, candidate).items()}
+
+
+def gains_of_each(seen: Information, prior: Information, candidate: Information) -> dict[str, Float64[Tensor, " n"]]:
+    """The part of every Gaussian in the gains."""
     before = seen + prior
     after, root = before + candidate, prior.geometry.diagonal(dim1=1, dim2=2).rsqrt()
-    sh_gain = float((after.sh / before.sh).log().sum())
     least = [eigenvalues(root[:, :, None] * each.geometry * root[:, None, :])[:, 0] for each in (before, after)]
     solved = torch.linalg.solve(before.geometry, candidate.geometry).diagonal(dim1=1, dim2=2)
     return {
-        "d": float((after.geometry.logdet() - before.geometry.logdet()).sum()) + sh_gain,
-        "t": float(solved.sum() + (candidate.sh / before.sh).sum()),
-        "e": float((least[1] / least[0]).log().sum()),
-        "d_diagonal": float((after.diagonal / before.diagonal).log().sum()),
-        "published": float((candidate.summed / (seen.summed + FISHERRF_LAMBDA)).sum()),
+        "d": after.geometry.logdet() - before.geometry.logdet() + (after.sh / before.sh).log().sum(dim=(1, 2)),
+        "t": solved.sum(dim=1) + (candidate.sh / before.sh).sum(dim=(1, 2)),
+        "e": (least[1] / least[0]).log(),
+        "d_diagonal": (after.diagonal / before.diagonal).log().sum(dim=1),
+        "published": (candidate.summed / (seen.summed + FISHERRF_LAMBDA)).sum(dim=1),
     }
 
 

@@ -21,8 +21,8 @@ class SplatFile:
     format: in words.  tool: who trained them, a name of `splat.training.origin.presets`; None where the file does not say.
     step: training steps.  antialiased: whether the renderer scaled opacities by the blur.  lossy: whether they were rounded to
     a few bits.  extra: further numbers of each Gaussian, by name.  settings: of the tool, by its names.  train: names of the
-    images it trained on.  notes: sentences on what was changed or is unsure.  other_axes: the same Gaussians with y and z
-    turned round, where writers of the format differ in that.
+    images that it trained on, where the file says them.  notes: sentences on what was changed or is unsure.  other_axes: the
+    same Gaussians with y and z turned round, where writers of the format differ in that.
     """
 
     gaussians: Gaussians
@@ -33,8 +33,14 @@ class SplatFile:
     lossy: bool = False
     extra: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
+    train: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     other_axes: Gaussians | None = None
+
+
+def names_of(found: object) -> tuple[str, ...]:
+    """Names of images as a file lists them; none where it is no list of words."""
+    return tuple(found) if isinstance(found, list) and all(isinstance(name, str) for name in found) else ()
 
 
 def packed(attributes: Mapping[str, np.ndarray], filter_widths: np.ndarray | None = None) -> Gaussians:

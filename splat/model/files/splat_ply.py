@@ -10,16 +10,18 @@ Postshot, OpenSplat, Mip-Splatting.
 nx ny nz are dropped; every other number rides along.  What a tool says about itself stands in the comments.
 """
 
+import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from landscape.errors import InputError
 from splat.model.files.ply import Header, Rows, ply_bytes, read_header, read_rows
-from splat.model.files.splat_file import SplatFile, finite_logits, packed
+from splat.model.files.splat_file import SplatFile, finite_logits, names_of, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
+from splat.model.untrusted import loose_json
 
 KNOWN = {*"xyz", "nx", "ny", "nz", "opacity", "filter_3D", "red", "green", "blue"}
 NAMED = re.compile(r"(scale|rot|f_dc|f_rest)_\d+")
@@ -30,7 +32,7 @@ COMMENTS = {
     "postshot": re.compile(r"^antialiased [01]$", re.I),
 }
 ANTIALIASED = re.compile(r"^(splatrendermode: mip|antialiased 1)$", re.I)
-TRAINED_BY = "trained by "  # our own comment
+TRAINED_BY, TRAINED_ON = "trained by ", "training views "  # our own comments; the names as a list in JSON
 
 
 def read_splat_ply(content: bytes) -> SplatFile:
@@ -54,6 +56,7 @@ def read_splat_ply(content: bytes) -> SplatFile:
         tool=_tool(header, rows),
         antialiased=widths is not None or any(ANTIALIASED.match(line.strip()) for line in header.comments),
         lossy=plain,
+        train=_train(header),
         extra={name: rows.numbers[name].astype(np.float32) for name in further},
         notes=(*(("it has plain colours and no spherical harmonics",) if plain else ()), *notes),
     )
@@ -110,17 +113,29 @@ def _tool(header: Header, rows: Rows) -> str | None:
     return "mip-splatting" if "filter_3D" in rows.names else None
 
 
+def _train(header: Header) -> tuple[str, ...]:
+    """Names of the training views; none where no comment, or none that can be read, says them."""
+    for line in header.comments:
+        if line.startswith(TRAINED_ON):
+            try:
+                return names_of(loose_json(line.removeprefix(TRAINED_ON)))
+            except InputError:
+                return ()
+    return ()
+
+
 def splat_ply(
     gaussians: Gaussians,
     extra: Mapping[str, np.ndarray] | None = None,
     tool: str | None = None,
     *,
     antialiased: bool = False,
+    train: Sequence[str] = (),
 ) -> bytes:
     """A file with graphdeco's properties in graphdeco's order, float32, and then those of `extra`, (n,) each by name.
 
-    Gaussians with a 3-D filter get Mip-Splatting's property for it too.  tool, antialiased: for the comments, the second in
-    Postshot's words.
+    Gaussians with a 3-D filter get Mip-Splatting's property for it too.  tool, antialiased, train (names of the training
+    views): for the comments, of which the second is Postshot's.
 
     InputError where a further property has the name of one of the Gaussians', or another length.
     """
@@ -146,4 +161,5 @@ def splat_ply(
     rows = np.empty(n, [(name, "f4") for name in columns])
     for name, column in columns.items():
         rows[name] = column
-    return ply_bytes(rows, [*([f"{TRAINED_BY}{tool}"] if tool else []), *(["antialiased 1"] if antialiased else [])])
+    comments = {f"{TRAINED_BY}{tool}": tool, "antialiased 1": antialiased, f"{TRAINED_ON}{json.dumps([*train])}": train}
+    return ply_bytes(rows, [line for line, wanted in comments.items() if wanted])

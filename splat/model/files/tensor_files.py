@@ -15,7 +15,7 @@ import io
 import re
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
-from splat.model.files.splat_file import SplatFile, finite_logits, packed
+from splat.model.files.splat_file import SplatFile, finite_logits, names_of, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.model.untrusted import require_whole
@@ -203,6 +203,7 @@ def _gsplat(ranks: list[Any]) -> SplatFile:
         _step(first.get("step")),
         antialiased=first.get("antialiased") is True,
         extra=extra,
+        train=names_of(first.get("training_views")),
         notes=notes,
     )
 
@@ -214,8 +215,10 @@ def gsplat_bytes(
     tool: str | None = None,
     *,
     antialiased: bool = False,
+    train: Sequence[str] = (),
 ) -> bytes:
-    """A checkpoint as gsplat's `simple_trainer` writes it; extra, (n,) each by name, tool and antialiased lie beside that."""
+    """A checkpoint as gsplat's `simple_trainer` writes it; beside that lie extra, (n,) each by name, tool, antialiased, and
+    train, the names of the training views."""
     values = {name: value.detach().cpu().float().clone() for name, value in gaussians.attributes.items()}
     splats = {
         "means": values["means"],
@@ -232,6 +235,8 @@ def gsplat_bytes(
         content["trained_by"] = tool
     if antialiased:
         content["antialiased"] = True
+    if train:
+        content["training_views"] = list(train)
     buffer = io.BytesIO()
     torch.save(content, buffer)
     return buffer.getvalue()

@@ -125,6 +125,10 @@ def _split(scene: Scene, found: SplatFile, ask: Foreign, path: Path, train: Sequ
     if ask.views is not None:
         return split_scene(scene, None if ask.views == "all" else ask.views), f"asked for: {ask.views}"
     held_out = split_scene(scene)
+    if found.train:
+        train = explicit_split(scene.names, found.train).train
+        others = [name for name in held_out.test if name not in train]
+        return explicit_split(scene.names, train, others), "as the file names them"
     if found.settings.get("eval") is False:
         held_out = explicit_split(scene.names, scene.names)
     used = _used(path, scene) if found.settings else set()
@@ -136,6 +140,12 @@ def _split(scene: Scene, found: SplatFile, ask: Foreign, path: Path, train: Sequ
         return held_out, "from cfg_args"
     if held_out.protocol == "named":
         return held_out, "as the scene's file lists them"
+    if not ask.guess_views:
+        raise InputError(
+            f"expected the training views of {path}, which neither it nor a file beside it names, got none; name them with "
+            "--views N (by the scene's protocol) or --train-list FILE, or say --guess-views for those that its tool holds by "
+            "default"
+        )
     if found.tool == "nerfstudio" and scene.kind == "transforms":
         count = len(scene.names)
         places = np.linspace(0, count - 1, ceil(count * NERFSTUDIO_SHARE), dtype=int)

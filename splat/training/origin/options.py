@@ -32,10 +32,11 @@ class Foreign(Trainer):
     scene: Path | None = None
     """Folder of the scene: of another tool's file, or where ours has moved to since the training."""
     views: int | Literal["all"] | None = None
-    """Number of training views, by the scene's protocol.  Default: what the tool's files say, else all that are not held
-    out."""
+    """Number of training views, by the scene's protocol.  Default: what the tool's files say."""
     train_list: Path | None = None
     """A text file with the name of a training view in each line."""
+    guess_views: bool = False
+    """Where nothing names its training views: those that its tool holds by default."""
     images: str | None = None
     """Folder of images within the scene.  Default: as `landscape train` has it."""
     downscale: float | None = None

@@ -41,7 +41,7 @@ def convert(*words: object) -> int:
 
 
 def test_round_trips_through_every_format_are_exact(folder):
-    scene = ("--scene", folder / "scene")
+    scene = ("--scene", folder / "scene", "--guess-views")
     assert convert(folder / "in.ply", folder / "a.pt", "--to", "gsplat") == 0
     assert convert(folder / "a.pt", folder / "b.ply") == 0
     assert read_splats(folder / "b.ply").extra["weight"].tolist() == (np.arange(60) / 7).astype(np.float32).tolist()
@@ -52,6 +52,7 @@ def test_round_trips_through_every_format_are_exact(folder):
         assert torch.equal(found.gaussians.flat, MADE.truth.flat) and found.tool == "splat-landscape", name
     loaded = load_checkpoint(folder / "run" / "checkpoint.pt")
     assert torch.equal(loaded.training.gaussians.flat, MADE.truth.flat)
+    assert [*read_splats(folder / "c.ply").train] == loaded.scene.train != []
     assert loaded.scene.find(folder / "run" / "checkpoint.pt") == folder / "scene"
 
 
@@ -63,7 +64,7 @@ def test_nothing_is_overwritten_and_our_own_needs_a_scene(folder, capsys):
 
 
 def test_a_ply_is_probed_and_its_record_says_what_was_assumed(folder):
-    common = [str(folder / "in.ply"), "--scene", str(folder / "scene"), "--max-views", "2"]
+    common = [str(folder / "in.ply"), "--scene", str(folder / "scene"), "--guess-views", "--max-views", "2"]
     quick = ["--quick", "--seconds", "inf", "--slice-points", "5"]
     assert main(["probe", *common, *quick, "--out", str(folder / "probe")]) == 0
     record = read_record(folder / "probe").data
@@ -178,7 +179,8 @@ def test_own_depths_are_read_by_the_training_that_is_suggested(folder, tmp_path,
 
 
 def test_depths_of_every_view_are_those_of_its_pixels_and_train_reads_them(folder):
-    assert convert(folder / "in.ply", folder / "depths", "--to", "depths", "--scene", folder / "scene") == 0
+    said = ("--scene", folder / "scene", "--guess-views")
+    assert convert(folder / "in.ply", folder / "depths", "--to", "depths", *said) == 0
     loaded = load_scene(folder / "scene", depths=folder / "depths").load()
     for view, truth in zip(loaded, MADE.scene.load(), strict=True):
         depth, alpha = render_depth(MADE.truth, truth.camera)

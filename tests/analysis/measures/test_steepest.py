@@ -5,12 +5,26 @@ import numpy as np
 import pytest
 import torch
 
-from analysis.measures.steepest import End, crop_around, outline_of, rendered_sentence, sentence, steepest
+from analysis.measures.steepest import (
+    NEAR,
+    End,
+    crop_around,
+    kink_curvature,
+    outline_of,
+    rendered_sentence,
+    sentence,
+    steepest,
+)
 from analysis.records.quantities import percent
 from splat.curvature.fields import scene_fields
 from splat.curvature.hessian import SceneHessian
+from splat.curvature.objective import SceneObjective
+from splat.losses.reference import LossSettings
 from splat.projection.reference import project
+from splat.render.render import render
 from tests.splat.curvature.test_fields import scene_of
+from tests.splat.held_scenes import BACKGROUND, two_views
+from tests.splat.random_scenes import random_gaussians
 
 NEEDLE = {"means": [0.9, 0.5, 4.0], "log_scales": [-0.9, -5.0, -5.0], "quats": [0.9, 0.0, 0.0, 0.4]}
 ROUND = [{"means": [-0.5, 0.2, 4.0], "log_scales": [-1.0] * 3}, {}]
@@ -148,3 +162,24 @@ def test_an_outline_of_an_upright_splat_points_up():
 def test_a_crop_has_the_outlines_of_all_carriers():
     left, top, right, bottom = crop_around([[40.0, 30.0, 5.0, 2.0, 0.0], [90.0, 60.0, 5.0, 2.0, 0.0]], 160, 120)
     assert left <= 35 and right >= 95 and top <= 28 and bottom >= 62
+
+
+def test_the_curvature_of_kinks_is_what_the_hessian_leaves_out_of_losses_at_finite_steps():
+    """Averaged over photographs whose residuals are even about 0."""
+    gaussians, views, stream = random_gaussians(15, 1, logit=1.0), two_views(), torch.Generator().manual_seed(0)
+    images = [render(gaussians, view.camera, BACKGROUND).image for view in views]
+    seen, said, smooth = [], [], LossSettings("charbonnier")
+    for _ in range(40):
+        noisy = [image + 0.1 * (torch.rand(image.shape, generator=stream) - 0.5).double() for image in images]
+        made = [view.with_image(image) for view, image in zip(views, noisy, strict=True)]
+        objective = SceneObjective(gaussians, made, LossSettings("l1", ssim_weight=0.0), BACKGROUND)
+        v = torch.randn(objective.active.flat.shape, generator=stream, dtype=torch.float64)
+        v = SceneHessian(objective).project(v[:, None])[:, 0]
+        v /= v.norm()
+        step = 0.5 * NEAR / float(max(view.jvp(v[:, None])[0, :3].abs().max() for view in objective.linearized))
+        losses = [objective.loss(objective.active.flat + sign * step * v) for sign in (-1, 0, 1)]
+        known = float(v @ SceneHessian(objective).apply(v[:, None])[:, 0])
+        seen.append((losses[0] - 2 * losses[1] + losses[2]) / step**2 - known)
+        said.append(kink_curvature(objective, v))
+    assert sum(seen) == pytest.approx(sum(said), rel=0.15) and min(said) > 0
+    assert kink_curvature(SceneObjective(gaussians, views, smooth, BACKGROUND), v) == 0.0

@@ -1,6 +1,7 @@
 """The record of a probe, its table, and what they say of budgets and of failed checks."""
 
 import json
+import re
 from contextlib import nullcontext
 from dataclasses import replace
 from io import StringIO
@@ -176,7 +177,8 @@ def test_time_that_ends_is_said_and_the_same_command_continues_to_the_same_numbe
 def test_the_summary_says_of_both_ends_what_renders_say_and_who_carries_them(record, dense):
     data = record.data
     lines = dict(line.split(maxsplit=1) for line in summary(data, Path("run/probe/report.html")))
-    assert "all 4 passed" in lines["checks"] and "participation ratio" in lines["spread"] and ">" not in str(lines)
+    assert "all 4 passed" in lines["checks"] and ">" not in str(lines)
+    assert re.match(r"half of all curvature lies in \S+( to \S+)? of [\d,]+ directions", lines["spread"])
     for name, end in (("steepest", data.eigenvalues.max), ("negative", data.eigenvalues.min)):
         steps, least = end.renders.steps, end.renders.optimiser_step
         assert steps == pytest.approx([steps[0] * 2**k for k in range(len(steps))]) and steps[5] == least
@@ -219,9 +221,11 @@ def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_pa
     assert main([*quick, str(tmp_path / "strict"), "--strict"]) == 1
     for name in ("lenient", "strict"):
         checks = read_record(tmp_path / name).data.checks
-        assert checks["symmetry"].passed is False and checks["finite_difference"].passed is False
+        assert (
+            checks["symmetry"].passed is False and checks["finite_difference"].passed is True
+        )  # that is of single views
     said = " ".join(capsys.readouterr().out.split())
-    assert "The check of symmetry failed" in said and "1 of 4 passed, not symmetry (" in said
+    assert "The check of symmetry failed" in said and "not symmetry (" in said and "steepest" not in said
 
 
 def test_settings_out_of_range_are_refused():

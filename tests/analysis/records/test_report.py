@@ -354,12 +354,24 @@ def test_attributes_have_no_order_where_an_error_is_not_known():
     assert not [line for line in summary(probe_of(data), Path()) if line.startswith("a step")]  # of a length not known
     data["steps"] = dict.fromkeys(data["traces"], 0.001)
     line = next(line for line in summary(probe_of(data), Path()) if line.startswith("a step"))
-    assert "most in position, then " in line and ">" not in line
+    assert "in position changes the loss " in line and "times as much as in " in line and ", then " in line
     for trace in data["traces"].values():
         trace["views_error"] = None
     line = next(line for line in summary(probe_of(data), Path()) if line.startswith("a step"))
     assert " then " not in line and line.count(" ≈ ") == len(data["traces"]) - 1
     assert "Its error does not separate it from" in sentences(data)
+
+
+def test_a_check_that_failed_leaves_no_number_that_it_puts_in_doubt():
+    data, _ = synthetic()
+    data["checks"]["finite_difference"] |= {"value": 20.3, "bound": 4.77e-4, "passed": False}
+    lines = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))
+    assert set(lines) == {"scene", "curvature", "checks", "report"}
+    assert lines["curvature"] == (
+        "the check of finite difference failed, which puts every curvature in doubt: none is told"
+    )
+    data["checks"]["finite_difference"]["passed"], data["checks"]["round_off"]["passed"] = True, False
+    assert "steepest" in {line.split()[0] for line in summary(probe_of(data), Path())}
 
 
 @pytest.mark.parametrize(
@@ -380,18 +392,23 @@ def test_attributes_have_no_order_where_an_error_is_not_known():
         ),
     ],
 )
-def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, found):
+@pytest.mark.parametrize("wide", [{}, {"wide": (4, -120.0, 14.0)}])
+def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, found, wide):
     data, _ = synthetic()
     rendered = {"steps": [1e-3, 2e-3, 4e-3], "optimiser_step": 2e-3, "ratios": [ratio] * 3, "errors": [0.1] * 3}
     rendered |= {"confirmed": confirmed} | ({"low": 1e-3, "high": 4e-3} if confirmed else {})
     data["eigenvalues"]["min"] |= {"value": -220.0, "residual": 1e-3, "reason": "tolerance", "renders": rendered}
     data["eigenvalues"]["min"]["carrier"] = {
-        "gaussian": 3739, "share": 0.9, "attribute": "quats", "shape": "a needle, 158 : 1 in the picture"
+        "gaussian": 3739, "share": 0.9, "attribute": "quats", "shape": "a needle, 158 : 1 in the picture",
+        "random_share": 0.002, "found": 10, **wide,
     }  # fmt: skip
     lines = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))
     over = ", one training" if not confirmed else "330 over the optimiser's step, one training"
     assert lines["negative"].startswith("−220 (" + over.removeprefix(", ").replace("330", "−330"))
-    assert lines["negative"].endswith(f"90% on Gaussian 3,739, a needle, 158 : 1 in the picture, turned; {said}")
+    who = "90% on Gaussian 3,739 (of a random direction 0.2%), a needle, 158 : 1 in the picture, turned; "
+    other = "none of the first 10 eigenvectors from this end lies on more than ten Gaussians"
+    other = "number 4 from this end (−120) is the first eigenvector on more than ten Gaussians" if wide else other
+    assert lines["negative"].endswith(f"{who}{other}; {said}")
     assert found in sentences(data) and "λ max / λ min" not in str(lines)
     assert ("times as curved as the steepest up" in sentences(data)) == (confirmed is True)
     tiles = [each["words"] for each in numbers(probe_of(data))]

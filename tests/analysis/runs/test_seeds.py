@@ -37,18 +37,41 @@ def test_a_difference_is_told_where_it_is_larger_than_the_spread_of_seeds():
     assert differences.endswith("; not in trace of opacity.")
 
 
-def test_indices_that_contradict_each_other_are_told():
-    def said(*rows: Row) -> str:
-        return sayings(grouped(rows, SINGLE), SINGLE)[-1]
+def steady(section: str, name: str, plain: float, sam: float) -> Row:
+    return row(section, name, *(plain + step for step in (-0.01, 0, 0.01)), *(sam + step for step in (-0.01, 0, 0.01)))
 
-    def rank(*values: float, half: float) -> Row:
-        return row("anisotropy", "participation ratio", *values, half=half)
 
-    share = row("anisotropy", "top mass", 0.1, 0.2, half=0.01)
-    contradict = "by top mass sam is the more anisotropic, but by participation ratio plain is the more anisotropic."
-    assert said(share, rank(50.0, 90.0, half=5.0)) == f"The indices contradict each other: {contradict}"
-    agree = "The indices that decide ({}) agree: sam is the more anisotropic of sam and plain."
-    assert said(share, rank(90.0, 50.0, half=5.0)) == agree.format("top mass, participation ratio")
-    assert said(share, rank(50.0, 90.0, half=30.0)) == agree.format("top mass")
-    assert said(rank(50.0, 90.0, half=30.0)) == "No index decides whether sam and plain differ in anisotropy."
-    assert "not known of groups of one run" in sayings(grouped([share], SINGLE), SINGLE)[0]
+def said(*rows: Row, groups: list[Group] = PAIR) -> str:
+    return sayings(grouped(rows, groups), groups)[-1]
+
+
+RANK, SHARE = "participation ratio", "top mass"
+
+
+def test_a_verdict_names_the_indices_that_differ_by_more_than_the_seeds():
+    share, rank = steady("anisotropy", SHARE, 0.1, 0.2), steady("anisotropy", RANK, 90.0, 50.0)
+    assert said(share, rank) == f"sam is the more anisotropic of sam and plain, by {SHARE} and {RANK}."
+    undecided = "Undecided which of sam and plain is the more anisotropic, because "
+    assert said(share, steady("anisotropy", RANK, 50.0, 90.0)) == (
+        f"{undecided}the indices contradict each other: by {SHARE} it is sam, but by {RANK} it is plain."
+    )
+    assert said(steady("anisotropy", RANK, 50.0, 50.01)) == (
+        f"{undecided}no index differs by more than the spread of the seeds."
+    )
+
+
+def test_one_training_of_each_decides_nothing():
+    told = sayings(grouped([row("anisotropy", SHARE, 0.1, 0.2, half=0.001)], SINGLE), SINGLE)
+    assert len(told) == 1 and told[0].startswith(
+        "Undecided which of sam and plain is the more anisotropic, because one training"
+    )
+
+
+def test_other_numbers_of_gaussians_decide_nothing_without_a_split_control():
+    rows = [steady("anisotropy", SHARE, 0.1, 0.2), steady("run", "Gaussians", 8000.0, 30000.0)]
+    assert said(*rows).endswith(
+        "because 30,000 Gaussians against 8,000 make an anisotropy of their own, which --split-control would measure."
+    )
+    control = steady("anisotropy", "  split control", 1.1, 1.2)
+    assert said(*rows, control).startswith("sam is the more anisotropic")
+    assert said(rows[0], steady("run", "Gaussians", 8000.0, 8500.0)).startswith("sam is the more anisotropic")

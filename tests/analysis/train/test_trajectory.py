@@ -10,8 +10,9 @@ from scipy.stats import t as student
 
 from analysis.commands.cli import main
 from analysis.train import command
-from analysis.train.trajectory import COLUMNS, TYPICAL, Trajectory, TrajectorySettings, measure
+from analysis.train.trajectory import COLUMNS, Trajectory, TrajectorySettings, measure
 from landscape import extreme_eigenpairs
+from landscape.errors import InputError
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
@@ -38,7 +39,7 @@ def arguments(scene: Path, out: str, *more: str) -> list[str]:
 
 
 def probed(scene: Path, out: str, *more: str) -> list[str]:
-    return arguments(scene, out, "--probe-every", str(EVERY), "--probe-share", "inf", *more)
+    return arguments(scene, out, "--probe-every", str(EVERY), *more)
 
 
 def rows(run: Path) -> pd.DataFrame:
@@ -79,7 +80,7 @@ def test_a_row_is_written_every_so_many_steps_with_every_column(run):
 
 def test_the_last_row_is_that_of_the_checkpoint(run, at_the_end, tmp_path):
     training, views, _, reference = at_the_end
-    trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY, float("inf")), reference)
+    trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY), reference)
     trajectory.after_step(1.0)
     written, (again,) = rows(run).iloc[-1], trajectory.rows
     assert {key: again[key] for key in again if key not in (*TIMES, "note")} == {
@@ -107,7 +108,7 @@ def test_the_search_for_the_ends_begins_at_the_directions_of_single_gaussians(at
 def test_a_row_is_the_landscape_within_its_errors(at_the_end, tmp_path):
     training, views, objective, reference = at_the_end
     few = replace(training, gaussians=training.gaussians.select(objective.mask.nonzero()[:15, 0]))
-    trajectory = Trajectory(tmp_path, few, views, TrajectorySettings(EVERY, float("inf")), reference)
+    trajectory = Trajectory(tmp_path, few, views, TrajectorySettings(EVERY), reference)
     trajectory.after_step(1.0)
     (row,) = trajectory.rows
     config = training.config
@@ -122,7 +123,7 @@ def test_a_row_is_the_landscape_within_its_errors(at_the_end, tmp_path):
         block = objective.blocks[name]
         exact = float(H[block, block].trace())
         assert abs(row[f"trace_{name}"] - exact) <= 4 * row[f"trace_{name}_error"] + rounding
-    known = {"eigenvalue_ratio": values[-1] / values[0], "negative_ratio": -values[-1] / values[0]}
+    known = {"eigenvalue_ratio": values[-1] / values[0], "negative_ratio": -values[0] / values[-1]}
     known |= {"top_mass": values[-1] / values.abs().sum()}
     for index, value in known.items():
         assert row[f"{index}_low"] - 1e-6 <= float(value) <= row[f"{index}_high"] + 1e-6, index
@@ -158,8 +159,8 @@ def test_a_run_killed_beside_a_checkpoint_and_resumed_gives_the_same_rows(scene,
 def test_exact_traces_are_those_that_samples_estimate(at_the_end):
     _, _, objective, _ = at_the_end
     exact, sampled = (
-        measure(objective, torch.Generator().manual_seed(0), TrajectorySettings(EVERY), level).traces
-        for level in ("whole", "coarse")
+        measure(objective, torch.Generator().manual_seed(0), TrajectorySettings(EVERY, quick)).traces
+        for quick in (False, True)
     )
     for name in ATTRIBUTES:
         assert exact[name].reason == "exact" and exact[name].standard_error == 0
@@ -168,68 +169,32 @@ def test_exact_traces_are_those_that_samples_estimate(at_the_end):
         assert abs(exact[name].value - sampled[name].value) <= surely * sampled[name].standard_error
 
 
-@pytest.fixture
-def along(at_the_end, tmp_path) -> Trajectory:
-    """The records of a long training with a tenth of its time, at a pace of a second."""
+def test_quick_records_are_all_coarse_and_none_is_left_out(scene):
+    assert main(probed(scene, "quick", "--probe-quick")) == 0
+    table = rows(scene.parent / "quick")
+    assert list(table["step"]) == list(range(0, STEPS + 1, EVERY)) and set(table["state"]) == {"coarse"}
+    assert table["lambda_max"].notna().all() and table["participation_ratio"].isna().all()
+
+
+def test_a_record_of_which_nothing_can_be_measured_says_why_and_whole_numbers_stay_so(
+    at_the_end, tmp_path, monkeypatch
+):
     training, views, _, reference = at_the_end
-    longer = replace(training, config=replace(training.config, iterations=10 * STEPS))
-    trajectory = Trajectory(tmp_path, longer, views, TrajectorySettings(EVERY, 0.1), reference)
-    trajectory.taken = {"coarse": (10.0, len(training.gaussians))}
-    return trajectory
+    along = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY), reference)
+    along.after_step(1.0)
+    assert along.skipped == ""
+
+    def refused(*_):
+        raise InputError("expected Gaussians in sight")
+
+    monkeypatch.setattr("analysis.train.trajectory.measure", refused)
+    along.after_step(2.0)
+    assert along.skipped == "of 2 records of the landscape 1 are empty: expected Gaussians in sight"
+    table = pd.read_csv(tmp_path / "trajectory.csv", dtype=str)
+    assert list(table["state"]) == ["whole", "skipped"] and table["visible_gaussians"].iloc[0].isdigit()
 
 
-WHOLE = 10 * TYPICAL["whole"] / TYPICAL["coarse"]  # seconds that are expected of the fixture's record
-
-
-@pytest.mark.parametrize(
-    ("allowed", "state"), [(19.0, "skipped"), (21.0, "coarse"), (9.9 + WHOLE, "coarse"), (10.1 + WHOLE, "whole")]
-)
-def test_a_record_between_is_as_fine_as_its_time_beside_that_of_the_last(along, allowed, state):
-    along.after_step(10 * allowed)
-    (row,) = along.rows
-    assert row["state"] == state
-    assert (row["note"] == "") == (state != "skipped") and pd.notna(row.get("lambda_max")) == (state != "skipped")
-    assert pd.notna(row.get("participation_ratio")) == (state == "whole")
-    if state == "skipped":
-        assert row["note"] == "no time: 10 s were needed at least, 9 s were allowed" and row["seconds"] == 0
-
-
-@pytest.mark.parametrize(("allowed", "state"), [(0.0, "coarse"), (WHOLE - 0.1, "coarse"), (WHOLE + 0.1, "whole")])
-def test_the_last_record_is_made_whatever_time_is_left(along, allowed, state):
-    along.training.config = replace(along.training.config, iterations=along.training.step)
-    along.after_step(10 * allowed)
-    assert [row["state"] for row in along.rows] == [state]
-
-
-@pytest.mark.parametrize(("pace", "state"), [(1e-9, "coarse"), (1e9, "whole")])
-def test_the_first_record_is_made_and_whole_where_half_of_the_time_allows(along, pace, state):
-    along.training.step, along.pace = 0, pace
-    along.before_steps()
-    (row,) = along.rows
-    assert (row["step"], row["state"], row["time_share"]) == (0, state, None)
-    along.before_steps()  # of a run that is resumed
-    assert len(along.rows) == 1
-
-
-def test_what_was_used_is_missing_later_and_whole_numbers_stay_so(along, tmp_path):
-    along.rows = [{"step": 10, "gaussians": 3, "state": "skipped", "note": "", "seconds": 990.0}]
-    along.after_step(1e4)
-    assert along.rows[-1]["state"] == "skipped"
-    along.after_step(1e6)
-    assert along.rows[-1]["state"] == "whole" and along.rows[-1]["time_share"] == pytest.approx(990 / 1e6, rel=1e-2)
-    assert pd.read_csv(tmp_path / "trajectory.csv", dtype=str)["visible_gaussians"].iloc[-1].isdigit()
-
-
-def test_a_training_without_time_for_them_has_its_first_and_last_record_and_says_so(scene, capsys):
-    assert main([*arguments(scene, "short"), "--probe-every", str(EVERY), "--probe-share", "1e-9"]) == 0
-    (said,) = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
-    assert said.startswith("of 5 records of the landscape, 3 skipped and 2 coarse (they may take 1e-09 of the time")
-    assert said.endswith("--probe-share inf sets no limit to their time")
-    assert list(rows(scene.parent / "short")["state"]) == ["coarse", *["skipped"] * 3, "coarse"]
-
-
-@pytest.mark.parametrize(("option", "value"), [("--probe-every", "0"), ("--probe-share", "0")])
-def test_options_out_of_range_are_refused(scene, tmp_path, capsys, option, value):
-    assert main([*arguments(scene, "refused", "--probe-every", "5"), option, value]) == 2
-    assert f"expected {option[2:].replace('-', '_')}" in capsys.readouterr().err
+def test_an_option_out_of_range_is_refused(scene, capsys):
+    assert main([*arguments(scene, "refused", "--probe-every", "0")]) == 2
+    assert "expected probe_every" in capsys.readouterr().err
     assert not (scene.parent / "refused").exists()

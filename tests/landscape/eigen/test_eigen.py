@@ -356,3 +356,15 @@ def test_one_value_is_not_settled_by_the_first_product():
 
     ends = extreme_eigenpairs(Diagonal(), torch.Generator().manual_seed(0), EigenSettings(1, 0, rtol=1e-2))
     assert float(ends.largest.values[0]) == pytest.approx(4.0, rel=1e-3)
+
+
+def test_further_pairs_continue_those_wanted_at_either_end():
+    values = torch.linspace(-3, 5, 40, dtype=torch.float64) ** 3
+    operator, generator = DenseOperator(torch.diag(values)), torch.Generator().manual_seed(0)
+    found = extreme_eigenpairs(operator, generator, EigenSettings(2, 1, rtol=1e-8, further=3))
+    assert found.further is not None
+    top, bottom = found.further
+    assert top.values[:2] == pytest.approx(values.flip(0)[2:4], rel=1e-6)
+    assert bottom.values[:2] == pytest.approx(values[1:3], rel=1e-6)
+    assert torch.equal(top.vectors.abs().argmax(dim=0)[:2], torch.tensor([37, 36]))
+    assert (top.vector_errors[:2] < 1e-3).all() and len(top) == len(bottom) == 3

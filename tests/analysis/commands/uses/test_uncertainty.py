@@ -28,7 +28,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 def run(folder: Path, *words: str) -> int:
-    return main(["uncertainty", str(folder / "in.ply"), "--scene", str(folder / "scene"), *words])
+    return main(["uncertainty", str(folder / "in.ply"), "--scene", str(folder / "scene"), "--guess-views", *words])
 
 
 def test_the_table_follows_from_the_maps(folder):

@@ -17,6 +17,7 @@ from PIL import Image
 from landscape.errors import InputError
 from splat.curvature.hessian import SceneHessian
 from splat.model.files.splat_ply import splat_ply
+from splat.model.files.tensor_files import gsplat_bytes
 from splat.model.gaussians import Gaussians
 from splat.scenes.scene import load_scene
 from splat.scenes.splits import split_scene, spread_views
@@ -51,7 +52,8 @@ def folder(tmp_path) -> Path:
 
 
 def opened(path: Path, train: Sequence[str] | None = None, **ask) -> Checkpoint:
-    return open_checkpoint(path, Foreign(**{"scene": path.parents[0] / "scene", **ask}), path, train)
+    ask = {"scene": path.parents[0] / "scene", "guess_views": True, **ask}
+    return open_checkpoint(path, Foreign(**ask), path, train)
 
 
 def stored(path: Path, content: bytes) -> Path:
@@ -218,7 +220,8 @@ def test_mip_splattings_ply_is_the_same_as_our_own_checkpoint_with_its_filter(fo
 def test_our_own_checkpoint_is_given_nothing_that_it_holds(folder):
     path = own(folder / "own.pt", folder / "scene")
     assert open_checkpoint(path, Foreign(scene=folder / "scene"), path).origin is None
-    refused("no --trained-by", opened, path, trained_by="gsplat")
+    with pytest.raises(InputError, match="no --trained-by"):
+        opened(path, trained_by="gsplat", guess_views=False)
 
 
 def names(*numbers: int) -> list[str]:
@@ -248,6 +251,31 @@ def test_views_are_asked_for_or_read_or_guessed_and_said(folder, settings, camer
     assert found.scene.train == expected
     assert found.origin and source in found.origin["views"]
     assert found.training.step == (50 if settings else 0)
+
+
+def test_views_that_nothing_names_are_asked_for(folder):
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
+    with pytest.raises(
+        InputError, match=r"training views of .*a\.ply.*got none; .*--views N.*--train-list.*--guess-views"
+    ):
+        opened(path, guess_views=False, trained_by=OURS)
+
+
+@pytest.mark.parametrize("kind", ["ply", "gsplat"])
+def test_our_own_files_name_their_views_and_hold_out_what_the_protocol_does(folder, kind):
+    train = names(3, 8)
+    content = splat_ply(gaussians(), train=train) if kind == "ply" else gsplat_bytes(gaussians(), 5, train=train)
+    found = opened(stored(folder / "a", content), guess_views=False, trained_by=OURS)
+    assert (found.scene.train, found.scene.test) == (train, names(0))
+    assert found.origin and found.origin["views"] == "as the file names them"
+    assert opened(folder / "a", views=2, trained_by=OURS).scene.train == names(1, 11)
+
+
+@pytest.mark.parametrize("listed", ["[1]", "nothing", "[" * 10**5])
+def test_a_comment_that_is_no_list_of_views_names_none(folder, listed):
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians()), (f"training views {listed}",)))
+    with pytest.raises(InputError, match="got none"):
+        opened(path, guess_views=False, trained_by=OURS)
 
 
 def test_nerfstudio_trains_on_nine_tenths_of_a_transforms_file(folder):

@@ -87,7 +87,7 @@ def test_whichever_signs_gsplat_had_the_cameras_find_them(tmp_path, scene, varia
     similarity = gsplat_frames(scene)[variant]
     path = tmp_path / "ckpt_1_rank0.pt"
     path.write_bytes(written.gsplat_pt(carried(flat(torch.float32), similarity)))
-    found = open_checkpoint(path, Foreign(scene=tmp_path / "scene"), path)
+    found = open_checkpoint(path, Foreign(scene=tmp_path / "scene", guess_views=True), path)
     assert found.scene.similarity is not None and found.origin
     np.testing.assert_allclose(found.scene.similarity, similarity, rtol=1e-9, atol=1e-12)
     camera = found.with_scene(path).scene.frames[0].camera
@@ -180,7 +180,7 @@ def test_another_tools_gaussians_are_probed_near_the_origin(tmp_path, exported_n
     file = near if exported_near else carried(flat(), np.column_stack([np.eye(3), away]))
     path = tmp_path / "a.ply"
     path.write_bytes(splat_ply(file.to(torch.float32)))
-    found = open_checkpoint(path, Foreign(scene=tmp_path / "scene", trained_by="gsplat-raw"), path)
+    found = open_checkpoint(path, Foreign(scene=tmp_path / "scene", guess_views=True, trained_by="gsplat-raw"), path)
     assert found.scene.similarity == shift.tolist()
     rounding = 1e-6 if exported_near else np.spacing(np.float32(60000))
     assert (found.training.gaussians.means - near.means).abs().max() <= rounding
