@@ -143,7 +143,7 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
 
 
 def _told(made: Provenance) -> dict[str, Any]:
-    """Provenance as plain types; of the views, of which there may be hundreds, the digest."""
+    """Provenance as plain types, but a digest in place of the views, which may be hundreds."""
     told = plain(made)
     if made.fingerprint:
         told["fingerprint"] |= {"data": made.fingerprint.digests["data"]}
@@ -158,7 +158,7 @@ def title(data: ProbeRecord) -> str:
 
 
 def passed(data: ProbeRecord) -> str:
-    """Number of self-checks that passed, and of those that could not run, in words; empty without checks."""
+    """How many self-checks passed, and how many could not run, in words; empty without checks."""
     results = [check.passed for check in data.checks.values()]
     text = f"{sum(map(bool, results))} of {len(results)} passed" if results else ""
     return text + (f", {missing} could not run" if (missing := results.count(None)) else "")

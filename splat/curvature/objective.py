@@ -59,8 +59,8 @@ class SceneObjective:
 
     gaussians: not modified.  loss_settings: l and R.  background: RGB in [0, 1], black by default.  sh_degree: of the bands in
     use, by default that of the Gaussians.
-    memory: bytes for linearized views and the workspace of their products (`KeptViews`); None: half of what is free when they
-    are made.  It decides how long products take, not their values.
+    memory: bytes for linearized views and the workspace of their products (`KeptViews`); None: half of the free memory.
+    It decides how long products take, not their values.
     keep_unseen: all Gaussians are active, for steps so long that Gaussians out of sight may come into sight.
 
     active: the Gaussians that touch a pixel of some view, with unit quaternions; L is studied at `active.flat` (p,).  mask:
@@ -104,7 +104,7 @@ class SceneObjective:
         for view in views:
             seen |= touches(rasterize_view(used, view.camera, self.background, self.settings, finite=True))
         if not seen.any():
-            raise NothingInSight(f"expected Gaussians in sight, got {len(gaussians)} of which no view sees any")
+            raise NothingInSight(f"expected Gaussians in sight, got {len(gaussians)} that no view sees")
         self.mask: Bool[Tensor, " n"] = torch.ones_like(seen) if keep_unseen else seen
         self.active = used.select(self.mask)
         quats = self.active.quats

@@ -146,7 +146,7 @@ class Gaussians(ShortRepr):
     def select(self, index: Tensor, sh_degree: int | None = None, fresh: Tensor | None = None) -> "Gaussians":
         """The Gaussians at index (a mask or indices, may repeat), with the SH bands up to sh_degree (zero-padded above).
 
-        fresh: a mask of those chosen whose numbers are 0 instead: for moments and directions, which new Gaussians lack.
+        fresh: a mask of the chosen; numbers are 0 there, for moments and directions, which new Gaussians lack.
         """
         degree = self.sh_degree if sh_degree is None else sh_degree
         chosen = {name: value[index] for name, value in self.attributes.items()}

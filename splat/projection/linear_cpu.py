@@ -146,9 +146,11 @@ def linearize_all(start, stop, jac, lens, means, log_scales, quats, logits, sh, 
             jac.colour_bar[e, c] = jac.visible[e, c] * moments[i, 6 + c]
             for k in range(bands):
                 weight[k] += sh[i, k, c] * jac.colour_bar[e, c]
+        # the geometry, in whitened coordinates; bar: the adjoint in plain ones
         mean, log_scale, quat, W = point(means, i), point(log_scales, i), quaternion(quats, i), whitening(splats[i])
         opacity = splats[i, 5]
         bar = plain_gradient(W, opacity, six_of(moments[i]))
+        # first derivatives and (a . P'') of mean, scales and quaternion; antialiased: of the opacity's factor too
         if widths is None:
             linearize_gaussian(lens, W, mean, log_scale, quat, bar, jac.jacobian[e], jac.curvature[e])
         else:
@@ -158,8 +160,10 @@ def linearize_all(start, stop, jac, lens, means, log_scales, quats, logits, sh, 
                 lens, W, mean, log_scale, quat, logit, width, bar, jac.jacobian[e], jac.curvature[e],
                 jac.opacity_slope[e], jac.opacity_curvature[e],
             )  # fmt: skip
+        # the opacity's logit
         jac.logit_slope[e] = 1 - opacity
         jac.logit_curvature[e] = (1 - opacity) * (1 - 2 * opacity) * moments[i, 0]
+        # the colour: harmonics, their slopes in the mean, and what they add to (a . P'')
         x, _s, _q = variables(jac.slope, mean, log_scale, quat)
         linearize_colour(lens, mean, x, weight, bands, jac.curvature[e], jac.harmonic[e], jac.slope[e])
         for c in range(3):
@@ -198,14 +202,17 @@ def push_forward(start, stop, jac, d_means, d_log_scales, d_quats, d_logits, d_s
         i = jac.index[e]
         for k in range(K):
             gather_tangent(u, i, k, d_means, d_log_scales, d_quats)
+            # ln opacity
             out[i, k, 0] = jac.logit_slope[e] * d_logits[i, k]
             for j in range(jac.opacity_slope.shape[1]):
                 out[i, k, 0] += jac.opacity_slope[e, j] * u[j]
+            # the five whitened coefficients of mean and conic
             for r in range(5):
                 total = out.dtype.type(0)
                 for j in range(GEOMETRY):
                     total += jac.jacobian[e, r, j] * u[j]
                 out[i, k, 1 + r] = total
+            # colours: by the direction to the mean, and by SH
             for c in range(3):
                 total = out.dtype.type(0)
                 for j in range(3):
@@ -260,6 +267,7 @@ def pull_back(
         for k in range(K):
             y = cotangents[i, k]
             gather_tangent(u, i, k, d_means, d_log_scales, d_quats)
+            # P'^T y in logit and geometry
             for c in range(3):
                 bar[c] = jac.visible[e, c] * y[6 + c]
             logit = jac.logit_slope[e] * y[0]
@@ -267,6 +275,7 @@ def pull_back(
             if second_order:
                 logit = add_curvature(jac, e, curvature, u, d_logits[i, k], h, logit)
             out_logits[i, k] += logit
+            # SH: P'^T y, and the mixed second derivatives of SH and mean both ways
             for b in range(bands):
                 slope, weight = jac.slope[e, b], out_means.dtype.type(0)
                 along = slope[0] * u[0] + slope[1] * u[1] + slope[2] * u[2]
@@ -295,6 +304,7 @@ def chain_blocks(start, stop, jac, blocks, second_order, geometry_out, sh_out):
     J, product = np.zeros((9, GEOMETRY + 1)), np.zeros(9)
     for e in range(start, stop):
         i = jac.index[e]
+        # J: the rows of P' over geometry and logit, one for each of the splat's nine numbers
         J[0, GEOMETRY] = jac.logit_slope[e]
         J[1:6, :GEOMETRY] = jac.jacobian[e]
         for j in range(jac.opacity_slope.shape[1]):
@@ -304,6 +314,7 @@ def chain_blocks(start, stop, jac, blocks, second_order, geometry_out, sh_out):
                 J[6 + c, j] = jac.visible[e, c] * jac.colour_slope[e, c, j]
             for b in range(bands):
                 sh_out[i, b, c] = jac.visible[e, c] * jac.harmonic[e, b] * jac.harmonic[e, b] * blocks[e, 6 + c, 6 + c]
+        # J^T B J, column by column
         for j in range(GEOMETRY + 1):
             for r in range(9):
                 product[r] = 0
@@ -316,6 +327,7 @@ def chain_blocks(start, stop, jac, blocks, second_order, geometry_out, sh_out):
                 if second_order and j < GEOMETRY:
                     total += jac.curvature[e, j * (j + 1) // 2 + k]
                 geometry_out[i, j, k] = geometry_out[i, k, j] = total
+        # (a . P'') of the logit, and of the logit with the geometry
         if second_order:
             geometry_out[i, GEOMETRY, GEOMETRY] += jac.logit_curvature[e]
             for j in range(jac.opacity_curvature.shape[1]):

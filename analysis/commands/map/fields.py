@@ -62,7 +62,7 @@ def require_known_field(name: str, known: Sequence[str]) -> None:
 def measured_fields(
     objective: SceneObjective, probe: Path, made: Fingerprint, notes: list[str], report: Progress
 ) -> Fields:
-    """Fields of the blocks and the views, and masses in the eigenvectors of the probe, where that is of what is asked for."""
+    """Fields of the blocks and the views, and masses in the eigenvectors of the probe, where that has the same subject."""
     values, sights = scene_fields(objective, report)
     ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, made, notes)
     if recorded is not None:

@@ -215,12 +215,14 @@ def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, secon
     for channel in range(3):
         top, first, last, rows_ahead = part_of(start, stop, channel, lead, frame)
         for ahead in rows_ahead:
+            # stage one: the row that comes in, blurred along itself
             if loss.structural != 0:
                 if target is None:
                     feed_pair(x, y, top, ahead, frame, rows, ring)
                 else:
                     feed(None, 0, x, y, top, ahead, frame, rows, ring, 0)
                 row = ahead - REACH
+                # stage two, REACH rows later: the window is whole; S and its slopes, blurred along the row
                 if first - reach <= row < last + reach:
                     if target is None:
                         distance = differentiate_pair(ring, row, frame, loss.margin, rows, values, slopes)
@@ -234,6 +236,7 @@ def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, secon
             row = ahead - lead
             if row < first:
                 continue
+            # stage three, REACH rows later again: blurred down the columns, with the pixel loss
             at = top + row * frame.stride
             if target is None:
                 total = finish_pair(x, y, at, row, frame, slopes, loss, gradient, other, values)
@@ -308,6 +311,7 @@ def product_rows(start, stop, frame, loss, x, y, blurred_sp, seconds, V, means, 
         for ahead in rows_ahead:
             row = ahead - REACH
             if loss.structural != 0:
+                # stages one and two of every vector: its fields blurred, then S_m', S_p', S_q'
                 inside = first - reach <= row < last + reach and 0 <= row < frame.height
                 for k in range(K):
                     feed(V[k], means[k, channel], x, y, top, ahead, frame, rows, ring, 3 * k)
@@ -318,6 +322,7 @@ def product_rows(start, stop, frame, loss, x, y, blurred_sp, seconds, V, means, 
             row = ahead - lead
             if row < first:
                 continue
+            # stage three: l'' v, or the sums of v . l'' v
             at = top + row * frame.stride
             for k in range(K):
                 if products is not None:

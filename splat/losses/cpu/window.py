@@ -12,7 +12,7 @@ whose relative error is round-off times mean / std, as that of rounding y itself
 subtracted is at most 1 / w_0 = 3.8 times the difference, w_0 the middle weight.
 
 Kernels take a range of rows, those of the three channels one after the other, and work out for themselves what they need
-beyond its ends.  Fields are flat plane sets (3, plane_rows, stride), of which (3, height, width) is the image.
+beyond its ends.  Fields are flat plane sets (3, plane_rows, stride); the image is their part (3, height, width).
 """
 
 from typing import NamedTuple

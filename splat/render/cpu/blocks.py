@@ -82,18 +82,22 @@ def block_of(params, lists, e, k, x0, y0, frame, state, shared, sums):
     for y in range(top, bottom):
         b = BLOCK * L * y
         v = row_v(frame, L, y, terms)
+        # undo the splat: w, and w and beta without the cap's pixels
         w, free, beta = undo_row(state, b, L, frame, v, terms, index)
         R, g, h = load3(state, b + BEHIND * L, L), load3(state, b + GRAD * L, L), load3(state, b + CURVATURE * L, L)
+        # D = dI/dq of the three colours, and the weight of the second derivative in q
         D, after, weight = step_block(w, free, beta, R, g, h, colour)
         store3(state, b + BEHIND * L, L, after)
         store(shared, 5 * L * y, w)
         store(shared, 5 * L * y + L, free)
         store3(shared, 5 * L * y + 2 * L, L, D)
         vv = v * v
+        # moments of this weight, v^0 to v^4
         m0, m1, m2 = m0 + weight, m1 + weight * v, m2 + weight * vv
         m3, m4 = m3 + weight * (vv * v), m4 + weight * (vv * vv)
     at = np.int64(lists.accumulator[e]) * BLOCK_SUMS
     store_powers(sums, at, u, m0, m1, m2, m3, m4)
+    # what mixes q and colour, channel by channel
     for c in range(3):
         add_channel(top, bottom, c, u, terms, frame, state, shared, sums, at, L, zero)
 
@@ -128,12 +132,15 @@ def reduce_blocks(start, stop, index, splat_start, sums, moments, second_order, 
     for e in range(start, stop):
         i = index[e]
         total[:] = 0
+        # a splat's sums lie side by side
         for accumulator in range(splat_start[i], splat_start[i + 1]):
             for j in range(BLOCK_SUMS):
                 total[j] += sums[accumulator * BLOCK_SUMS + j]
+        # the block is symmetric: each of its entries is one of the sums
         for p in range(SPLAT):
             for q in range(SPLAT):
                 blocks[e, p, q] = total[BLOCK_INDEX[p, q]]
+                # the curvature of q in its coefficients, times the moments of s
                 if second_order:
                     for j in range(3):
                         blocks[e, p, q] += D2Q[j, p, q] * moments[i, j]

@@ -43,6 +43,7 @@ def forward(counter, params, lists, frame, pixels):
     tile = next_tile(counter, lists)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        # nothing in front yet: T = 1, no pixel has stopped, black
         for y in range(TILE_ROWS):
             b = FORWARD * L * y
             store(state, b + T * L, 1.0)
@@ -51,6 +52,7 @@ def forward(counter, params, lists, frame, pixels):
         first = np.int64(lists.start[tile])
         count = lists.start[tile + 1] - first
         some_stopped = False
+        # front to back; every 16 splats: have all pixels stopped?
         for k in range(count):
             prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
             some_stopped |= composite(params, lists, first + k, k, x0, y0, frame, state)
@@ -72,6 +74,7 @@ def composite(params, lists, e, k, x0, y0, frame, state):
     for y in range(top, bottom):
         b = FORWARD * L * y
         before = load(state, b + T * L)
+        # alpha of the row, 0 where the pixel has stopped
         alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, before > 0.0, frame.cap)
         w = alpha * before
         after = fma(-alpha, before, before)  # T - w, to the last bit even where alpha is near 1
@@ -81,6 +84,7 @@ def composite(params, lists, e, k, x0, y0, frame, state):
             after = select(ends, -before, after)
             store(state, b + STOP * L, select(ends, k, load(state, b + STOP * L)))
             stopped = True
+        # C += w c, T -= w
         store(state, b + T * L, after)
         store3(state, b + IMAGE * L, L, plus(load3(state, b + IMAGE * L, L), w, colour))
     return stopped
@@ -117,11 +121,14 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
+            # behind all splats: the final T, and R of the background
             begin_backward_row(state, BACKWARD * L * y, L, frame, pixels, v_planes, corner + y * frame.stride)
         first, count = reached(lists, tile, pixels, corner, frame.stride)
+        # a tile without cotangent adds nothing
         if dark(v_planes, 0, 4, corner, frame.size, frame.stride):
             clear_sums(lists, first, count, SPLAT, sums)
             count = 0
+        # back to front
         for k in range(count - 1, -1, -1):
             later = first + max(k - AHEAD, 0)
             prefetch(params, np.int64(lists.splat[later]) * PARAMS)
@@ -148,11 +155,14 @@ def differentiate(params, lists, e, k, x0, y0, frame, state, sums):
     for y in range(top, bottom):
         b = BACKWARD * L * y
         v = row_v(frame, L, y, terms)
+        # alpha as in `forward`
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
         R, v_image = load(state, b + REST * L), load3(state, b + GRAD * L, L)
+        # T and R in front of the splat; s = dL/dq, 0 where the cap holds
         before, rest, w, beta, _r, we = step_back(alpha, load(state, b + T * L), R, v_image, colour)
         s = select(uncapped <= frame.free, we - beta * R, 0.0)
         store(state, b + T * L, before)
         store(state, b + REST * L, rest)
+        # sums of s v^k and of w v_image over the rows; the columns follow once for all
         moments = add_row(moments, v, s, w, v_image)
     store_moments(sums, np.int64(lists.accumulator[e]), moments, u)

@@ -60,6 +60,7 @@ def coupled_blocks(counter, index, params, frame, size, footprints, image, targe
     corners = np.empty((frame.size // (TILE_ROWS * L), 2), np.int64)
     moved, sums, total = scratch(params, FACTORS * SLOPES * L), scratch(params, PAIRS * L), np.empty(PAIRS)
     part = np.empty(PAIRS, params.dtype)
+    # a splat a turn, the largest first
     turn = fetch_and_increment(counter)
     while turn < index.size:
         splat = index[turn]
@@ -84,12 +85,14 @@ def find_spans(params, splat, frame, width, footprints, corners, spans, weights)
     for a in range(first, last):
         row, column = layout.tiles[a] // frame.columns * TILE_ROWS, layout.tiles[a] % frame.columns * L
         corners[a - first, 0], corners[a - first, 1] = row, column
+        # the rows of a new row of tiles have no columns yet
         for y in range(max(row, done), row + TILE_ROWS):
             spans[y, 0], spans[y, 1] = frame.stride, -1
         done = row + TILE_ROWS
         top, bottom = row_range(layout.rows[a])
         for y in range(top, bottom):
             store(weights, 0, load(values, (layout.place[a] - layout.place[begin] + y - top) * FOOTPRINT * L))
+            # widen the row's span by the pixels with weight
             for x in range(min(L, width - column)):
                 if weights[x] > 0:
                     spans[row + y, 0], spans[row + y, 1] = min(spans[row + y, 0], column + x), column + x
@@ -147,11 +150,13 @@ def sum_windows(params, splat, channel, box, frame, size, footprints, planes, wo
         row = ahead - REACH  # of the windows' centres: all of their rows are there now
         if row < 0 or row >= size[0]:
             continue
+        # the columns that any window of this row can see of the splat
         lo, hi = hull_of(spans, max(row - REACH, y0), min(row + REACH, y1))  # of the splat within these windows
         if hi < 0:
             continue
         lo, hi = lo - left, hi - left
         columns = (max(lo - REACH, 0) // L * L, min((hi + REACH) // L, vectors - 1) * L)
+        # down the columns, then along the row, then into the sums
         blur_columns(work, row, lo // L * L, hi, columns, pitch, L)
         add_windows(params, splat, row, left, columns, frame, planes, pitch, work)
         unflushed += 1
@@ -183,9 +188,11 @@ def fill_row(params, splat, channel, y, box, frame, image_width, footprints, a, 
     pitch, row = vectors * L + 2 * EDGE, y & -TILE_ROWS
     base = slot(y) * FIELDS * pitch + EDGE - left
     first, last = layout.splat_start[splat], layout.splat_start[splat + 1]
+    # skip the tiles above this row
     while corners[a - first, 0] < row:
         a += 1
     at = a
+    # the tiles of this row, as far as the splat has weight in them
     while at < last and corners[at - first, 0] == row:
         top, bottom = row_range(layout.rows[at])
         inside, x = y - row, corners[at - first, 1]
@@ -204,8 +211,10 @@ def fill_lanes(params, splat, x, y, channel, frame, image_width, where, values, 
     _u, terms = alpha_terms(params, splat * PARAMS, x, y)
     v = terms[0]
     inside = iota(params) < broadcast(params, image_width - x)
+    # w and D, 0 beyond the image
     w, D = select(inside, load(values, where), 0.0), select(inside, load(values, where + (1 + channel) * L), 0.0)
     photo = load(target, top + y * frame.stride + x)
+    # the factors f: 1, 2 r, y - c
     residual = load(image, top + y * frame.stride + x) - photo
     put_powers(ring, to, pitch, w, D, v)
     put_powers(ring, to + POWERS * pitch, pitch, 2.0 * residual * w, 2.0 * residual * D, v)
@@ -306,11 +315,14 @@ def add_windows(params, splat, row, left, columns, frame, planes, pitch, work):
 def blur_row(rows, at, pitch, u, along, moved, to):
     """Blur along a row, for the vector at `at`: one component of M for each slope, to moved."""
     L = lanes(rows)
+    # D f: B_0, B_1 and B_2 from the sums and differences at equal distances
     F, s, d = load(rows, at), sums_around(rows, at, 1), differences_around(rows, at)
     B0, B1, B2 = F * MIDDLE + dot5(s, TAPS), along * dot5(d, FIRST), along * along * dot5(s, SECOND)
+    # D f v: the same without the second power of u
     Fv, sv = load(rows, at + pitch), sums_around(rows, at + pitch, 1)
     C0, C1 = Fv * MIDDLE + dot5(sv, TAPS), along * dot5(differences_around(rows, at + pitch), FIRST)
     uB = u * B0 + B1
+    # slopes D, D u, D v, D u^2, D u v; then D v^2 and w, which have no u
     store(moved, to, B0)
     store(moved, to + L, uB)
     store(moved, to + 2 * L, C0)

@@ -105,8 +105,8 @@ def footprint_of(params, lists, e, k, x0, y0, frame, state, found, at):
 
 @kernel
 def find_neighbours(counter, params, lists, frame, pixels, width, height, covered, before):
-    """For every intersection fill `covered`, the number of pixels of the image in which its splat has weight, and `before`, the
-    splat next in front of it among those of its tile that have weight in one of these pixels, or -1."""
+    """For each intersection: `covered`, how many pixels its splat has weight in; `before`, the nearest splat in front
+    that shares one of these pixels, or -1."""
     L = lanes(params)
     state, row = scratch(params, 2 * L * TILE_ROWS), scratch(params, L)  # state: stop, last intersection with weight
     tile = next_tile(counter, lists)

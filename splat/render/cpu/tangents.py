@@ -114,9 +114,11 @@ def tangent_single(params, tangents, lists, e, k, x0, y0, frame, state):
     for y in range(top, bottom):
         b = (2 + TANGENT) * L * y
         v = row_v(frame, L, y, terms)
+        # alpha and T as in `forward`
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
         before = load(state, b + T * L)
         store(state, b + T * L, fma(-alpha, before, before))
+        # q' = the tangent's quadratic in v, 0 where the cap holds
         dq = select(uncapped <= frame.free, quadratic(v, dterms), 0.0)
         w = alpha * before
         tangent_row(state, b + 2 * L, L, alpha, w, w * dq, colour, dcolour)
@@ -128,6 +130,7 @@ def tangent_block(params, tangents, K, lists, e, k, x0, y0, frame, state, shared
     L = lanes(params)
     width = (2 + TANGENT * K) * L
     splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
+    # first what all tangents share: alpha, w, and w without the cap's pixels
     for y in range(top, bottom):
         b = width * y
         alpha, uncapped = alpha_row(row_v(frame, L, y, terms), terms, index < load(state, b + STOP * L), frame.cap)
@@ -136,6 +139,7 @@ def tangent_block(params, tangents, K, lists, e, k, x0, y0, frame, state, shared
         w = alpha * before
         free = select(uncapped <= frame.free, w, 0.0)
         store3(shared, 3 * L * y, L, (alpha, w, free))
+    # then each tangent over the rows, which are in the cache
     for i in range(K):
         dterms, dcolour = tangent_terms(tangents, (splat * K + i) * SPLAT, u)
         for y in range(top, bottom):
@@ -189,6 +193,7 @@ def begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_p
     last, dT = load(pixels.transmittance, p), load(transmittances, i * frame.size + p)
     v_pixel = load_cotangent(v_planes, p, frame.size)
     dv_pixel = load_cotangent(dv_planes, 4 * i * frame.size + p, frame.size)
+    # tau = T' / T, and R = T (v_image . background + ...) differentiated
     store(state, b + TAU * L, dT / last)
     rest = dT * behind_all(v_pixel, frame.background) + last * behind_all(dv_pixel, frame.background)
     store(state, b + DREST * L, rest)
@@ -225,11 +230,14 @@ def backward_tangent_single(params, tangents, lists, e, k, x0, y0, frame, state,
     for y in range(top, bottom):
         b = (BACKWARD + BACKWARD_TANGENT) * L * y
         v = row_v(frame, L, y, terms)
+        # undo the splat in T and R
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
         v_image = load3(state, b + GRAD * L, L)
         w, beta, rR = backward_row(state, b, L, alpha, v_image, colour)
+        # and in tau and R', for s' and h
         dq = select(uncapped <= frame.free, quadratic(v, dterms), 0.0)
         ds, h = backward_tangent_row(state, b + BACKWARD * L, L, w, beta, rR, dq, v_image, colour, dcolour)
+        # s' is 0 where the cap holds; h belongs to the colour
         moments = add_row(moments, v, select(uncapped <= frame.free, ds, 0.0), w, h)
     store_moments(sums, np.int64(lists.accumulator[e]), moments, u)
 
@@ -240,11 +248,13 @@ def backward_tangent_block(params, tangents, K, lists, e, k, x0, y0, frame, stat
     L = lanes(params)
     width = (BACKWARD + BACKWARD_TANGENT * K) * L
     splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
+    # first what all tangents share: w, beta, r R, and alpha without the cap
     for y in range(top, bottom):
         b, x = width * y, 4 * L * y
         alpha, uncapped = alpha_row(row_v(frame, L, y, terms), terms, index < load(state, b + STOP * L), frame.cap)
         store3(shared, x, L, backward_row(state, b, L, alpha, load3(state, b + GRAD * L, L), colour))
         store(shared, x + 3 * L, uncapped)
+    # then the sums of each tangent
     for i in range(K):
         dterms, dcolour = tangent_terms(tangents, (splat * K + i) * SPLAT, u)
         moments = no_moments(params)

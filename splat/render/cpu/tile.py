@@ -109,10 +109,13 @@ def alpha_terms(params, o, x0, y0):
 
     The offset of the tile's corner is in double precision: far from the mean, v of a needle is a small difference.
     """
+    # whitened offset of a pixel (dx, dy): u = along dx, v = across (shear dx + dy)
     along, across = params[o + ALONG], params[o + ACROSS]
     shear = np.float64(params[o + SHEAR]) + params[o + SHEAR_REST]
+    # from the mean to the tile's corner; the rest of each rounded number is added
     dx = x0 - np.float64(params[o + MX]) - params[o + MX_REST]
     dy = y0 - np.float64(params[o + MY]) - params[o + MY_REST]
+    # the columns are 0, 1, ... pixels from the corner; a row adds `across` to v
     u = fma(iota(params), along, along * dx)
     v = fma(iota(params), across * shear, across * (shear * dx + dy))
     terms = (v, broadcast(params, across), fma(-u, u, params[o + LO]), broadcast(params, params[o + CUT]))
@@ -152,9 +155,11 @@ def begin_undo_row(state, b, L, frame, pixels, p):
 def undo_row(state, b, L, frame, v, terms, index):
     """Undo a splat in T of a row; w, and w and beta where the cap does not hold."""
     alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
+    # T in front of the splat: T / (1 - alpha)
     r = reciprocal(1.0 - alpha)
     before = load(state, b + T * L) * r
     store(state, b + T * L, before)
+    # where the cap holds alpha does not depend on q: no derivative
     w, free = alpha * before, uncapped <= frame.free
     return w, select(free, w, 0.0), select(free, alpha * r, 0.0)
 

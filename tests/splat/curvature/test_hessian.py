@@ -202,7 +202,7 @@ def test_what_cannot_be_an_objective_is_refused():
         SceneObjective(gaussians, two_views(), LOSS, torch.full((3,), float("inf")))
     behind = random_gaussians(5)
     behind.means[:, 2] = -9.0
-    refused("expected Gaussians in sight, got 5 of which no view sees any", objective, behind)
+    refused("expected Gaussians in sight, got 5 that no view sees", objective, behind)
     broken = random_gaussians(5, 1)
     broken.sh[4, 1, 2] = float("inf")
     refused(r"expected finite sh, got .*inf.* at Gaussian 4", objective, broken)
