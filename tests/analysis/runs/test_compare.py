@@ -355,7 +355,7 @@ def test_files_of_other_tools_are_compared_as_they_were_probed(trained, tmp_path
         file.write_bytes(splat_ply(synthetic_scene(SETTINGS).truth, tool="splat-landscape"))
     words = [*map(str, files), "--scene", scene, "--views", "3", "--opacity-reg", "0.01"]
     commands = [
-        f"landscape probe {file} --scene {scene} --out {tmp_path}/probe-{file.stem} --opacity-reg 0.01 --views 3"
+        f"landscape probe {file} --out {tmp_path}/probe-{file.stem} --opacity-reg 0.01 --scene {scene} --views 3"
         for file in files
     ]
     refused(capsys, words, "expected probed runs", "; ".join(commands), "--probe")
