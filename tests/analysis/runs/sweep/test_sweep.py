@@ -310,7 +310,7 @@ def test_two_sweeps_share_the_cells_and_the_last_writes_all(folder, tmp_path, mo
 
 
 def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, folder):
-    controlled = "[probe]\nsplit_control = true\nfamily_seconds = 7"
+    controlled = "[probe]\nsplit_control = true\nper_attribute_seconds = 7"
     with_probe = read_sweep(finished.file, probe=True)
     control = read_sweep(written(folder, "[scenes.still]", f"{controlled}\n[scenes.still]"))
     cell = with_probe.cells[0]
