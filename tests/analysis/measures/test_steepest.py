@@ -114,9 +114,8 @@ def test_steps_change_the_loss_as_the_curvature_has_it(shown):
     assert second == pytest.approx(end.curvature, rel=0.3)  # the step is finite
     assert end.curvature * found.steps[0] ** 2 / 2 == pytest.approx(0.01 * middle)
     place = found.steps.index(found.step)
-    assert found.factors[place] == pytest.approx(second / end.curvature) and found.factors[0] == pytest.approx(
-        1, abs=0.1
-    )
+    assert found.factors[place] == pytest.approx(second / end.curvature)
+    assert found.factors[0] == pytest.approx(1, abs=0.1)
     assert found.rendered == rendered_sentence(end, middle, found.steps, found.factors)
     left, top, right, bottom = found.crop
     assert pictures["zero"].shape == pictures["photograph"].shape == (bottom - top, right - left, 3)

@@ -1,9 +1,6 @@
 """Probes that are refused, interrupted or killed, or whose pictures fail: what they say and what they leave."""
 
 import shutil
-import signal
-import subprocess
-import sys
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +10,6 @@ from analysis.records.records import read_record
 from splat.scenes.synthetic import synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from tests.analysis.probe.probed import SCENE
-from tests.waiting import waits_for
 
 ROOT = Path(__file__).parents[3]
 
@@ -70,20 +66,6 @@ def test_a_scene_that_has_moved_is_named_with_the_option_and_found_there(run, tm
     finally:
         away.rename(still)
     assert read_record(tmp_path / "probe").data.provenance.scene_folder == str(away)
-
-
-def test_a_probe_that_is_killed_leaves_the_old_record_whole(run, record, tmp_path):
-    out = tmp_path / "kept"
-    shutil.copytree(record.folder, out)
-    before = (out / "probe.json").read_bytes()
-    command = ["probe", str(run / "checkpoint.pt"), "--out", str(out), "--quick"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "analysis.commands.cli", *command], cwd=ROOT, stderr=subprocess.DEVNULL
-    )
-    waits_for(lambda: list(tmp_path.glob(".kept.partial-*/probe.json")), process)  # it is writing the new one
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    assert (out / "probe.json").read_bytes() == before and read_record(out).data.provenance.dtype == "float64"
 
 
 def test_an_interrupted_probe_keeps_its_stages_and_says_how_to_go_on(run, tmp_path, monkeypatch, capsys):

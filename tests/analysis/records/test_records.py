@@ -355,9 +355,8 @@ def test_a_record_changed_anywhere_is_read_or_refused_in_a_sentence(tmp_path, na
                 place
             )
         else:
-            assert (
-                isinstance(record.data, SliceRecord) and of_slice(record.data.slice, record.data.provenance) is not None
-            )
+            assert isinstance(record.data, SliceRecord)
+            assert of_slice(record.data.slice, record.data.provenance) is not None
     assert 100 < read < 900
 
 

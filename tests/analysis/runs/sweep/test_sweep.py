@@ -323,9 +323,8 @@ def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, fold
         assert probe_arguments(cell, control)[4:] == ["--split-control", "--per-attribute-seconds", "7.0"]
         row = results([cell], {cell.name: "done"}).iloc[0]
         assert row["trace_means"] == data["traces"]["means"]["value"] and row["lambda_min_error"] == 3.0
-        assert (row["negative_ratio_low"], row["negative_ratio_high"]) == (1 / 143.0, 1 / 139.0) and row[
-            "top_mass"
-        ] is None
+        assert (row["negative_ratio_low"], row["negative_ratio_high"]) == (1 / 143.0, 1 / 139.0)
+        assert row["top_mass"] is None
         data["provenance"] |= recorded.own(
             cell.out, split_control=True, per_attribute_seconds=7.0
         )  # more than was asked for
