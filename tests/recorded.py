@@ -98,60 +98,33 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
     ritz = np.concatenate([-np.geomspace(-bottom, 1e-3 * scale, 20), np.geomspace(1e-3 * scale, top, 40)])
     ritz.sort()
     residuals = np.abs(ritz) * np.minimum(1.0, 1e-4 * np.exp(np.minimum(np.arange(60), 59 - np.arange(60)) / 1.5))
-    data = {
-        "objective": {"loss": "0.8 L1 + 0.2 (1 - SSIM)", "operator": "hessian", "value": 0.0832, "gradient_norm": 0.41},
-        "traces": traces,
-        "eigenvalues": {
-            "max": {"value": top, "residual": 12.0 * scale, "matvecs": 60, "method": "lanczos", "reason": "tolerance"},
-            "min": {
-                "value": bottom,
-                "residual": 3.0 * scale,
-                "matvecs": 60,
-                "method": "lanczos",
-                "reason": "time budget",
-            },
-        },
-        "anisotropy": {
-            "eigenvalue_ratio": {"value": top / bottom, "low": -143.0, "high": -139.0, "note": ""},
-            "negative_ratio": {"value": -bottom / top, "low": 1 / 143.0, "high": 1 / 139.0, "note": ""},
-            "top_mass": {"value": None, "low": None, "high": None, "note": NEEDS_DENSITY},
-        },
-        "slice": _plane(scale),
-        "counts": {
-            "gaussians": 10091,
-            "visible_gaussians": 9874,
-            "parameters": 595369,
-            "active_parameters": 136682,
-            "sh_degree_stored": 3,
-            "sh_degree_active": 0,
-            "views": 3,
-            "products": 140,
-        },
-        "checks": {
-            "symmetry": {"value": 3e-7, "bound": 1e-5, "passed": True},
-            "round_off": {"value": 0.0, "bound": 1e-6, "passed": True},
-            "finite_difference": {
-                "value": None,
-                "bound": 1e-3,
-                "passed": None,
-                "note": "every direction crosses a sort",
-            },
-        },
-        "timing": {"load": 0.4, "linearise": 0.9, "traces": 8.2, "eigenvalues": 21.5, "slice": 14.0, "total": 45.0},
-        "notes": ["SH bands 1 to 3 are not in use and were left out"],
-        "provenance": plain(provenance(seed, lanes=16, checkpoint="checkpoint.pt", scene="fern", iteration=2000)),
+    found = {"matvecs": 60, "method": "lanczos"}
+    ends = {
+        "max": {"value": top, "residual": 12.0 * scale, **found, "reason": "tolerance"},
+        "min": {"value": bottom, "residual": 3.0 * scale, **found, "reason": "time budget"},
     }
-    arrays = {
-        "traces": samples,
-        "spectrum": {
-            "ritz_values": ritz,
-            "residuals": residuals,
-            "nodes": ritz * random.uniform(0.9, 1.0, (3, 60)),
-            "weights": random.dirichlet(np.ones(60), 3),
-        },
-        "slice": _grid(top, second),
+    indices = {
+        "eigenvalue_ratio": {"value": top / bottom, "low": -143.0, "high": -139.0, "note": ""},
+        "negative_ratio": {"value": -bottom / top, "low": 1 / 143.0, "high": 1 / 139.0, "note": ""},
+        "top_mass": {"value": None, "low": None, "high": None, "note": NEEDS_DENSITY},
     }
-    return data, arrays
+    counts = {"gaussians": 10091, "visible_gaussians": 9874, "parameters": 595369, "active_parameters": 136682}
+    counts |= {"sh_degree_stored": 3, "sh_degree_active": 0, "views": 3, "products": 140}
+    skipped = {"value": None, "bound": 1e-3, "passed": None, "note": "every direction crosses a sort"}
+    checks = {
+        "symmetry": {"value": 3e-7, "bound": 1e-5, "passed": True},
+        "round_off": {"value": 0.0, "bound": 1e-6, "passed": True},
+        "finite_difference": skipped,
+    }
+    loss = {"loss": "0.8 L1 + 0.2 (1 - SSIM)", "operator": "hessian", "value": 0.0832, "gradient_norm": 0.41}
+    data = {"objective": loss, "traces": traces, "eigenvalues": ends, "anisotropy": indices, "slice": _plane(scale)}
+    data |= {"counts": counts, "checks": checks, "notes": ["SH bands 1 to 3 are not in use and were left out"]}
+    data["timing"] = {"load": 0.4, "linearise": 0.9, "traces": 8.2, "eigenvalues": 21.5, "slice": 14.0, "total": 45.0}
+    made = provenance(seed, lanes=16, checkpoint="checkpoint.pt", scene="fern", iteration=2000)
+    data["provenance"] = plain(made)
+    spectrum = {"ritz_values": ritz, "residuals": residuals, "nodes": ritz * random.uniform(0.9, 1.0, (3, 60))}
+    spectrum["weights"] = random.dirichlet(np.ones(60), 3)
+    return data, {"traces": samples, "spectrum": spectrum, "slice": _grid(top, second)}
 
 
 def depth_section(ratio: float | None = 0.0068) -> dict[str, Any]:
@@ -160,47 +133,29 @@ def depth_section(ratio: float | None = 0.0068) -> dict[str, Any]:
     trace = {"value": 3.9e-4, "standard_error": 1e-5, **known}
     rise = {"depth": 1.4e-4, "depth_error": 1e-5, "depth_crossed": 0.75, "lateral": 5e-4, "lateral_error": 2e-6}
     rows = [{"pixels": 0.1, "ratio": 0.28, "ratio_error": 0.02, "lateral_crossed": 0.5, **rise}]
-    return {
-        "gradient_ratio": ratio,
-        "gradient_median": ratio,
-        "pairs": 23054,
-        "curvature": {"depth": trace, "lateral": {"value": 20.4, "standard_error": 0.3, **known}},
-        "curvature_ratio": {"value": 3.8e-5, "low": 3.7e-5, "high": 3.9e-5, "note": ""},
-        "rises": rows,
-    }
+    curvature = {"depth": trace, "lateral": {"value": 20.4, "standard_error": 0.3, **known}}
+    quotient = {"value": 3.8e-5, "low": 3.7e-5, "high": 3.9e-5, "note": ""}
+    section = {"gradient_ratio": ratio, "gradient_median": ratio, "pairs": 23054, "curvature": curvature}
+    return section | {"curvature_ratio": quotient, "rises": rows}
 
 
 def _trace(draws: np.ndarray, dim: int) -> dict[str, Any]:
     value, error = float(draws.mean()), float(draws.std(ddof=1) / np.sqrt(len(draws)))
     low, high = value - 2.13 * error, value + 2.13 * error
-    return {
-        "value": value,
-        "standard_error": error,
-        "low": low,
-        "high": high,
-        "confidence": 0.95,
-        "tau": float(np.sqrt(max(value, 0.0) / dim)),
-        "dim": dim,
-        "probes": len(draws),
-        "sign": "undetermined" if low * high <= 0 else "positive" if low > 0 else "negative",
-        "method": "rademacher",
-        "reason": "tolerance",
-    }
+    sign = "undetermined" if low * high <= 0 else "positive" if low > 0 else "negative"
+    found = {"value": value, "standard_error": error, "low": low, "high": high, "confidence": 0.95, "sign": sign}
+    found |= {"tau": float(np.sqrt(max(value, 0.0) / dim)), "dim": dim, "probes": len(draws)}
+    return found | {"method": "rademacher", "reason": "tolerance"}
 
 
 def _plane(scale: float) -> dict[str, Any]:
     curvatures = {"e₁": 3.1e4 * scale, "e₂": 1.2e4 * scale}
-    return {
-        "directions": [
-            {"name": name, "curvature": c, "residual": 1e-3 * c, "unit": float(np.sqrt(2 * 8e-4 / c))}
-            for name, c in curvatures.items()
-        ],
-        "loss_scale": 8e-4,
-        "center_loss": 0.0832,
-        "points": 357,
-        "crossed_points": 326,
-        "evaluations": 357,
-    }
+    directions = [
+        {"name": name, "curvature": c, "residual": 1e-3 * c, "unit": float(np.sqrt(2 * 8e-4 / c))}
+        for name, c in curvatures.items()
+    ]
+    counts = {"points": 357, "crossed_points": 326, "evaluations": 357}
+    return {"directions": directions, "loss_scale": 8e-4, "center_loss": 0.0832, **counts}
 
 
 def _grid(top: float, second: float) -> dict[str, np.ndarray]:
@@ -221,39 +176,15 @@ def synthetic_line(scale: float = 1.0) -> tuple[dict[str, Any], dict[str, dict[s
     model = center + 2e-3 * scale * x + curvature * x**2 / 2
     evaluated = np.arange(21) % 2 == 0
     steps = np.array([1e-6, 1e-5, 1e-4, 1e-3])
-    direction = {
-        "name": "gradient",
-        "kind": "gradient",
-        "slope": 2e-3 * scale,
-        "curvature": curvature,
-        "residual": None,
-    }
-    data = {
-        "objective": whole["objective"],
-        "slice": {
-            "directions": [direction | {"unit": 2e-3, "length": 1.0, "scale": "stored units"}],
-            "loss_scale": 8e-5 * scale,
-            "cosine": None,
-            "center_loss": center,
-            "points": 21,
-            "evaluated_points": 11,
-            "crossed_points": 6,
-            "evaluations": 12,
-            "interpolation_error": 0.004,
-            "holdout_points": 3,
-        },
-        "finite_probe": {
-            "steps": steps.tolist(),
-            "curvatures": [-3e4 * scale, 41.0 * scale, 55.0 * scale, 70.0 * scale],
-            "round_off": [4e4 * scale, 4.0 * scale, 0.04 * scale, 4e-4 * scale],
-            "truncation": [1.0, 1.0, 1.0, 1.0],
-            "crossed": [False, False, True, True],
-            "infinitesimal": curvature,
-            "best": 1,
-        },
-        **{name: whole[name] for name in ("counts", "timing", "notes", "provenance")},
-    }
+    direction = {"name": "gradient", "kind": "gradient", "slope": 2e-3 * scale, "curvature": curvature}
+    direction |= {"residual": None, "unit": 2e-3, "length": 1.0, "scale": "stored units"}
+    line = {"directions": [direction], "loss_scale": 8e-5 * scale, "cosine": None, "center_loss": center, "points": 21}
+    line |= {"evaluated_points": 11, "crossed_points": 6, "evaluations": 12, "interpolation_error": 0.004}
+    probe = {"steps": steps.tolist(), "curvatures": [c * scale for c in (-3e4, 41.0, 55.0, 70.0)], "best": 1}
+    probe |= {"round_off": [error * scale for error in (4e4, 4.0, 0.04, 4e-4)], "truncation": [1.0] * 4}
+    probe |= {"crossed": [False, False, True, True], "infinitesimal": curvature}
+    data = {"objective": whole["objective"], "slice": line | {"holdout_points": 3}, "finite_probe": probe}
+    data |= {name: whole[name] for name in ("counts", "timing", "notes", "provenance")}
     loss = model + 15.0 * scale * x * np.abs(x)
-    return data, {
-        "slice": {"x": x, "loss": loss, "model": model, "crossed": evaluated & (x > 0), "evaluated": evaluated}
-    }
+    arrays = {"x": x, "loss": loss, "model": model, "crossed": evaluated & (x > 0), "evaluated": evaluated}
+    return data, {"slice": arrays}
