@@ -72,7 +72,9 @@ STEPS = [0.2, 0.1, 0.05]
 
 
 MEAN = "the mean of back and forth (by its curvature alone:"
-REFUTED = "along e is not confirmed by renders: steps of 0.0500 to 0.200 stored units"
+STEP, RANGE = "A step of 0.100 stored units along e", "steps of 0.0500 to 0.200 stored units"
+REFUTED = f"along e is not confirmed by renders: {RANGE}"
+TOGETHER = "back and forth together, where by the curvature"
 
 
 @pytest.mark.parametrize(
@@ -82,22 +84,15 @@ REFUTED = "along e is not confirmed by renders: steps of 0.0500 to 0.200 stored 
         (
             4.0,
             [3.0, 0.9, 1.0],
-            f"A step of 0.100 stored units along e raises the loss by 0.90%, {MEAN} 1.00%); "
-            "over steps of 0.0500 to 0.200 stored units by 0.900 to 3.00 times what the curvature has.",
+            f"{STEP} raises the loss by 0.90%, {MEAN} 1.00%); over {RANGE} by 0.900 to 3.00 times what ",
         ),
-        (-4.0, [-1.0, 1.1, 1.0], "A step of 0.100 stored units along e lowers the loss by 1.10%, "),
+        (-4.0, [-1.0, 1.1, 1.0], f"{STEP} lowers the loss by 1.10%, "),
         (
             -4.0,
             [-1.0, 0.5, 0.6],
-            f"A step of 0.100 stored units along e lowers the loss by 0.50%, {MEAN} 1.00%), "
-            "0.500 times as much as the curvature has it; ",
+            f"{STEP} lowers the loss by 0.50%, {MEAN} 1.00%), 0.500 times as much as the curvature has",
         ),
-        (
-            -4.0,
-            [-0.2, -1.4, -1.9],
-            f"The negative curvature {REFUTED} raise the loss, back and forth together, where by the curvature they would "
-            "lower it.",
-        ),
+        (-4.0, [-0.2, -1.4, -1.9], f"The negative curvature {REFUTED} raise the loss, {TOGETHER} they would lower it."),
         (4.0, [-0.2, -1.4, -1.9], f"The curvature {REFUTED} lower the loss, "),
     ],
 )

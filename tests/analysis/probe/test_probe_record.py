@@ -80,21 +80,8 @@ def test_a_checkpoint_can_be_probed_with_the_loss_of_3dgs(run, tmp_path, no_pict
     other = replace(loaded.training, config=replace(loaded.training.config, loss=LossSettings("l2", literal=True)))
     for name, training, options in (("plain", loaded.training, []), ("other", other, ["--loss", "3dgs"])):
         save_checkpoint(run / f"{name}.pt", training, loaded.scene)
-        assert (
-            main(
-                [
-                    "probe",
-                    str(run / f"{name}.pt"),
-                    "--quick",
-                    "--seconds",
-                    "inf",
-                    "--out",
-                    str(tmp_path / name),
-                    *options,
-                ]
-            )
-            == 0
-        )
+        words = ["probe", str(run / f"{name}.pt"), "--quick", "--seconds", "inf", "--out", str(tmp_path / name)]
+        assert main([*words, *options]) == 0
     plain, probed = (read_record(tmp_path / name, ProbeRecord).data for name in ("plain", "other"))
     assert probed.objective == plain.objective and probed.traces == plain.traces
 

@@ -83,18 +83,9 @@ def test_mean_deviation_and_ratio_are_taken_over_the_seeds_of_a_method():
 
 
 def test_times_by_the_clock_are_compared_only_at_as_many_threads():
-    rows = with_ratios(
-        pd.DataFrame(
-            {
-                "scene": "a",
-                "method": ["x", "y", "z"] * 2,
-                "seed": [0, 0, 0, 1, 1, 1],
-                "wall_seconds": [10.0, 30.0, 30.0] * 2,
-                "cpu_seconds": [9.0, 18.0, 27.0] * 2,
-                "threads": [2.0, 2.0, 1.0, None, 2.0, None],
-            }
-        )
-    )
+    columns = {"scene": "a", "method": ["x", "y", "z"] * 2, "seed": [0, 0, 0, 1, 1, 1]}
+    columns |= {"wall_seconds": [10.0, 30.0, 30.0] * 2, "cpu_seconds": [9.0, 18.0, 27.0] * 2}
+    rows = with_ratios(pd.DataFrame({**columns, "threads": [2.0, 2.0, 1.0, None, 2.0, None]}))
     assert rows["wall_ratio"].dropna().tolist() == [1.0, 3.0] and rows["cpu_ratio"].tolist() == [1.0, 2.0, 3.0] * 2
     (line,) = of_other_threads(rows)
     assert line.startswith("a/z/0, a/x/1, a/y/1, a/z/1: not trained with as many threads")
