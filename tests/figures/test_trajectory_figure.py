@@ -125,14 +125,8 @@ def test_the_command_prints_first_and_last_values_and_writes_the_files(tmp_path,
     lines = [line.split() for line in said.splitlines()]
     assert ["3dgs/0", "(1", "skipped)", "step", "1,000", "(whole)", "step", "2,000", "(whole)"] in lines
     assert ["largest", "eigenvalue", "2.00", "±", "0.10", "4.00", "±", "0.10"] in lines
-    assert lines[lines.index(["eigenvalue", "ratio", "−4.00", "−16.0"]) + 1] == [
-        "−4.40",
-        "to",
-        "−3.60",
-        "−17.6",
-        "to",
-        "−14.4",
-    ]
+    place = lines.index(["eigenvalue", "ratio", "−4.00", "−16.0"]) + 1
+    assert lines[place] == ["−4.40", "to", "−3.60", "−17.6", "to", "−14.4"]
     assert ["participation", "ratio", "≥", "10.0", "≥", "20.0"] in lines  # of which nothing else is certain
 
 

@@ -18,26 +18,16 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.875], dtype=torch.float64)
 def two_views(width: int = 30, height: int = 22) -> list[View]:
     """Cameras apart from each other, random pictures."""
     generator = torch.Generator().manual_seed(0)
-    return [
-        View(
-            str(seed),
-            random_camera(width, height, seed=seed, focal=28.0),
-            torch.rand(3, height, width, generator=generator),
-        )
-        for seed in (1, 2)
-    ]
+    views = [(str(seed), random_camera(width, height, seed=seed, focal=28.0)) for seed in (1, 2)]
+    return [View(name, camera, torch.rand(3, height, width, generator=generator)) for name, camera in views]
 
 
 def mean_loss(
     gaussians: Gaussians, views: Sequence[View], loss: LossSettings, settings: RenderSettings = RenderSettings()
 ) -> Tensor:
     """The specification's loss of the views, with its regularisers of all the Gaussians."""
-    losses = [
-        photometric_loss(
-            render(gaussians, view.camera, BACKGROUND, settings, backend="reference").image, view.image.double(), loss
-        )
-        for view in views
-    ]
+    images = [render(gaussians, view.camera, BACKGROUND, settings, backend="reference").image for view in views]
+    losses = [photometric_loss(image, view.image.double(), loss) for image, view in zip(images, views, strict=True)]
     opacity, scale = gaussians.opacity_logits.sigmoid().mean(), gaussians.log_scales.exp().mean()
     return torch.stack(losses).mean() + loss.opacity_reg * opacity + loss.scale_reg * scale
 

@@ -84,11 +84,7 @@ def test_a_training_starts_from_another_tools_gaussians_with_its_renderer(folder
         str(folder / "scene"),
         "--from",
         str(source),
-        "--no-densify",
-        "--iterations",
-        "2",
-        "--views",
-        "2",
+        *["--no-densify", "--iterations", "2", "--views", "2"],
     ]
     assert main([*common, "--trained-by", "gsplat-raw", "--out", str(out)]) == 0
     training = load_checkpoint(out / "checkpoint.pt").training

@@ -86,14 +86,8 @@ def test_pictures_are_drawn_of_the_views_that_were_asked_for(folder):
 
 
 def test_a_run_folder_is_mapped_like_the_file_it_was_made_of(folder):
-    words = [
-        str(folder / "in.ply"),
-        str(folder / "run" / "checkpoint.pt"),
-        "--scene",
-        str(folder / "scene"),
-        "--views",
-        "all",
-    ]
+    run = str(folder / "run" / "checkpoint.pt")
+    words = [str(folder / "in.ply"), run, "--scene", str(folder / "scene"), "--views", "all"]
     assert main(["convert", *words]) == 0 and main(["map", str(folder / "run"), "--draw", "0"]) == 0
     found, before = (read_map(path / "map") for path in (folder / "run", folder))
     assert (found.fragility, found.shades, found.sentences) == (before.fragility, before.shades, before.sentences)

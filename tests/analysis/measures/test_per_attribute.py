@@ -374,12 +374,8 @@ def test_memory_bounds_the_vectors_that_are_kept(objective, checkpoint):
 
 
 def test_a_time_that_is_none_is_refused(path, tmp_path, capsys):
-    assert (
-        main(
-            ["probe", str(path), "--out", str(tmp_path / "probe"), "--metric", "scene", "--per-attribute-seconds", "0"]
-        )
-        == 2
-    )
+    words = ["probe", str(path), "--out", str(tmp_path / "probe"), "--metric", "scene", "--per-attribute-seconds", "0"]
+    assert main(words) == 2
     assert "above 0 for --per-attribute" in capsys.readouterr().err and list(tmp_path.iterdir()) == []
 
 

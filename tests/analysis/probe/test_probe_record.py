@@ -216,12 +216,13 @@ def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_pa
 
 
 def test_settings_out_of_range_are_refused():
-    for wrong in (
-        {"slice_points": 3},
-        {"slice_points": 6},
-        {"slice_rise": 0.0},
-        {"density_matvecs": 5},
-        {"memory": -1.0},
+    for key, value in (
+        ("slice_points", 3),
+        ("slice_points", 6),
+        ("slice_rise", 0.0),
+        ("density_matvecs", 5),
+        ("memory", -1.0),
     ):
+        wrong: dict = {key: value}
         with pytest.raises(ValueError, match="expected"):
             replace(ProbeSettings(), **wrong)

@@ -42,13 +42,8 @@ def record(folder: Path, scale: float, **changes) -> None:
     effects = [
         {"operator": "hessian", "block": block, "index": "negative_ratio", **FACTOR} for block in ("all", "means")
     ]
-    data["split_control"] = {
-        "gaussians": 20182,
-        "rms": 0.01 * scale,
-        "largest": 0.1,
-        "psnr": 40.0 / scale,
-        "effects": effects,
-    }
+    data["split_control"] = {"gaussians": 20182, "rms": 0.01 * scale, "largest": 0.1, "psnr": 40.0 / scale}
+    data["split_control"]["effects"] = effects
     end = {"value": 4.0, "residual": 0.1, "reason": "tolerance"}
     about = {"operator": "hessian", "block": "means", "metric": "parameters", "unit": "stored units", "split": False}
     index = {"value": 7.0 * scale, "low": 6.0 * scale, "high": 9.0 * scale, "note": ""}

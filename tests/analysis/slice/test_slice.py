@@ -360,12 +360,8 @@ def few(run: Path, tmp_path: Path) -> str:
     ],
 )
 def test_bad_input_gets_one_sentence_and_leaves_no_record(run, tmp_path, capsys, options, words):
-    named = {
-        "BEHIND": str(run / "behind.pt"),
-        "OTHER": str(run / "turned.pt"),
-        "SAME": str(run / "double.pt"),
-        "NOWHERE": str(tmp_path / "nowhere.pt"),
-    }
+    named = {"BEHIND": "behind", "OTHER": "turned", "SAME": "double"}
+    named = {key: str(run / f"{name}.pt") for key, name in named.items()} | {"NOWHERE": str(tmp_path / "nowhere.pt")}
     if "FEW" in options:
         named["FEW"] = few(run, tmp_path)
     out = tmp_path / "out" / "slice"

@@ -40,14 +40,9 @@ def jumps(theta):
 
 
 def sliced(loss, seed=0, axes=(SIDE, SIDE), **settings):
-    return evaluate_slice(
-        loss,
-        torch.zeros(2, dtype=torch.float64),
-        PLANE[:, : len(axes)],
-        list(axes),
-        settings=SliceSettings(**settings),
-        generator=torch.Generator().manual_seed(seed),
-    )
+    center, generator = torch.zeros(2, dtype=torch.float64), torch.Generator().manual_seed(seed)
+    chosen, directions = SliceSettings(**settings), PLANE[:, : len(axes)]
+    return evaluate_slice(loss, center, directions, list(axes), settings=chosen, generator=generator)
 
 
 @cache

@@ -24,20 +24,9 @@ def by_hand(
     clamp = (settings.fov_clamp * camera.width / (2 * camera.fx), settings.fov_clamp * camera.height / (2 * camera.fy))
     pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
     means, log_scales, quats, logits, sh = (value.numpy() for value in gaussians.attributes.values())
-    splats = [
-        splat_of_gaussian(
-            means[i],
-            log_scales[i],
-            quats[i],
-            sh[i],
-            camera.rotation.numpy(),
-            camera.centre.numpy(),
-            pinhole,
-            clamp,
-            settings.blur,
-        )
-        for i in range(len(gaussians))
-    ]
+    pose = camera.rotation.numpy(), camera.centre.numpy(), pinhole, clamp, settings.blur
+    rows = zip(means, log_scales, quats, sh, strict=True)
+    splats = [splat_of_gaussian(*row, *pose) for row in rows]
     sigmas = np.inf if settings.contour_sigma is None else settings.contour_sigma
     return composited_picture(
         splats, 1 / (1 + np.exp(-logits)), BACKGROUND.numpy(), (camera.width, camera.height),

@@ -102,11 +102,8 @@ def test_products_cost_the_passes_that_are_stated():
 
 def test_jumps_of_the_image_are_left_out(monkeypatch):
     """Weights under 0.3 are dropped.  With central differences, the products at the same steps are all jumps."""
-    H, exact, V = (
-        Bumps(torch.float32, cut=0.3).hessian(noise=3e-6),
-        Bumps(cut=0.3).exact(),
-        vectors(24, 8, torch.float32),
-    )
+    H, exact = Bumps(torch.float32, cut=0.3).hessian(noise=3e-6), Bumps(cut=0.3).exact()
+    V = vectors(24, 8, torch.float32)
     assert error(H.apply(V), exact.apply(V.double())) < 0.05
     monkeypatch.setattr(renderer, "one_sided", lambda ahead, behind: ((ahead + behind) / 2, torch.zeros(40) > 0))
     assert error(H.apply(V), exact.apply(V.double())) > 1

@@ -23,11 +23,8 @@ from splat.training.methods.stablegs.viewpoint_probe import ViewpointSettings, c
 from tests.refusals import refused
 
 NONE = ViewpointSettings(edge_rotation=False, interpolation=False, parallax=False, capture="forward")
-EDGE, INTERPOLATION, PARALLAX = (
-    replace(NONE, edge_rotation=True),
-    replace(NONE, interpolation=True),
-    replace(NONE, parallax=True),
-)
+MODES = ("edge_rotation", "interpolation", "parallax")
+EDGE, INTERPOLATION, PARALLAX = (replace(NONE, **{name: True}) for name in MODES)
 SHELL = replace(PARALLAX, capture="360")
 NORMAL = torch.tensor([cos(0.5), sin(0.5)], dtype=torch.float64)
 
