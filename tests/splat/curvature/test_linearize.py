@@ -16,11 +16,12 @@ from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings, photometric_loss
 from splat.model.gaussians import Gaussians
 from splat.model.settings import Antialias, RenderSettings
+from splat.projection.reference import project
 from splat.render.render import render
 from splat.scenes.view import View
 from tests.oracles import central_difference
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, mean_loss, two_views
-from tests.splat.random_scenes import ANTIALIASED, MODES, filtered, random_gaussians, random_like
+from tests.splat.random_scenes import ANTIALIASED, MODES, filtered, random_camera, random_gaussians, random_like
 from tests.splat.tiny import SMOOTH
 from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, NUMPY, errors_by_block, relative_error
 
@@ -94,6 +95,24 @@ def test_float32_keeps_its_digits_through_the_whole_chain(mode):
     assert relative_error(held.image, image) < IMAGE[torch.float32]
     assert max(errors_by_block(held.gradient, gradient, gaussians.blocks).values()) < DERIVATIVE[torch.float32]
     assert max(errors_by_block(held.hvp(U.float()), products, gaussians.blocks).values()) < DERIVATIVE[torch.float32]
+
+
+def test_float32_keeps_its_digits_in_needles_too():
+    """Lines across the image, most of them longer than wide by a factor of 15."""
+    gaussians, generator = random_gaussians(40, 1, logit=-1.0), torch.Generator().manual_seed(0)
+    share = torch.rand(40, 3, generator=generator, dtype=torch.float64)
+    gaussians.log_scales[:] = share * torch.tensor([1.5, 0.5, 0.5]) - torch.tensor([1.5, 6.0, 6.0])
+    gaussians = gaussians.to(torch.float32).to(torch.float64)
+    view = View("", random_camera(120, 90, seed=1, focal=112.0), torch.rand(3, 90, 120, generator=generator))
+    a, b, c = project(gaussians, view.camera, SMOOTH).conics.T
+    ratios = torch.linalg.cond(torch.stack([a, b, b, c], dim=1).view(-1, 2, 2)).sqrt()
+    assert ratios.median() > 15 and ratios.max() > 50
+    U = random_like((gaussians.flat.numel(), 3), 1).float()
+    single, double = (hold(gaussians, view, LossSettings("l2"), dtype, SMOOTH) for dtype in DTYPES)
+    found = [(single.image, double.image), (single.gradient, double.gradient), (single.hvp(U), double.hvp(U.double()))]
+    blocks = [held.block_diagonal(approximate=True).diagonals for held in (single, double)]
+    found += [(blocks[0][name], diagonal) for name, diagonal in blocks[1].items()]
+    assert max(relative_error(one, other) for one, other in found) < DERIVATIVE[torch.float32]
 
 
 def image_and_alpha(gaussians: Gaussians, view: View, flat: Tensor, settings: RenderSettings) -> Tensor:
