@@ -34,23 +34,13 @@ from splat.render.forward import background_of
 from splat.render.render import render
 from splat.scenes.scene import load_scene
 from splat.scenes.splits import Split
-from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
-from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
 from splat.training.methods.methods import METHODS
 from splat.training.methods.stablegs.stablegs import StableGS
 from tests.refusals import refused
 
 ROOT = Path(__file__).parents[3]
-SETTINGS = SyntheticSettings(gaussians=60, views=5, width=24, height=18)
 ITERATIONS = 12
-
-
-@pytest.fixture(scope="session")
-def original(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("scenes") / "still"
-    write_transforms_scene(synthetic_scene(SETTINGS).scene, folder)
-    return folder
 
 
 @pytest.fixture

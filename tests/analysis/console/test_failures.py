@@ -14,7 +14,6 @@ from analysis.commands import cli
 from analysis.console.failures import report
 from analysis.console.plain import say
 from landscape.errors import InputError
-from splat.training.checkpoint import load_checkpoint
 
 TRACEBACK = "Traceback (most recent call last)"
 
@@ -65,18 +64,6 @@ def test_debug_shows_the_traceback_before_and_after_the_subcommand(monkeypatch, 
     monkeypatch.undo()
     assert cli.main(["train", "no/such/scene", "--debug"]) == 2
     assert capsys.readouterr().err.startswith(TRACEBACK)
-
-
-@pytest.mark.parametrize("error", [MemoryError(), OSError(errno.EIO, "I/O error"), RuntimeError("out of memory")])
-def test_what_the_machine_lacks_is_not_called_damage_to_a_file(monkeypatch, tmp_path, error):
-    def fail(*_, **__):
-        raise error
-
-    monkeypatch.setattr("zipfile.ZipFile", fail)
-    (tmp_path / "checkpoint.pt").write_bytes(b"")
-    with pytest.raises(type(error)) as caught:
-        load_checkpoint(tmp_path / "checkpoint.pt")
-    assert caught.value is error
 
 
 @pytest.mark.parametrize("evil", ["\x1b[2J", "\x1b]0;x\x07", "\x9b2J", "\x08\x7f"])

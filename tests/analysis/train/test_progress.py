@@ -11,18 +11,9 @@ from analysis.commands.cli import main
 from analysis.train import command
 from splat.losses.reference import photometric_loss, psnr
 from splat.render.render import render
-from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
-from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 
 STEPS = 25
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("progress") / "still"
-    write_transforms_scene(synthetic_scene(SyntheticSettings(gaussians=60, views=5, width=24, height=18)).scene, folder)
-    return folder
 
 
 def words(scene: Path, out: Path, *more: str) -> list[str]:
@@ -31,9 +22,9 @@ def words(scene: Path, out: Path, *more: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def run(scene) -> Path:
-    out = scene.parent / "run"
-    assert main(words(scene, out, "--keep-checkpoints", "all")) == 0
+def run(original, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("progress") / "run"
+    assert main(words(original, out, "--keep-checkpoints", "all")) == 0
     return out
 
 
@@ -51,14 +42,14 @@ def test_a_row_is_the_first_training_view_as_the_checkpoint_renders_it(run):
         assert row["gaussians"] == len(training.gaussians)
 
 
-def test_what_is_kept_is_the_checkpoint_of_its_step_and_finds_its_scene(scene, run):
+def test_what_is_kept_is_the_checkpoint_of_its_step_and_finds_its_scene(original, run):
     assert {path.name for path in run.glob("step-*")} == {"step-5", "step-10", "step-15", "step-20", "step-25"}
     last, kept = load_checkpoint(run / "checkpoint.pt"), load_checkpoint(run / "step-25" / "checkpoint.pt")
     assert torch.equal(last.training.gaussians.flat, kept.training.gaussians.flat)
-    assert (run / "step-25" / kept.scene.relative).resolve() == scene.resolve()
+    assert (run / "step-25" / kept.scene.relative).resolve() == original.resolve()
 
 
-def test_the_oldest_of_those_that_stay_go_but_for_what_else_is_in_their_folders(scene, tmp_path, monkeypatch):
+def test_the_oldest_of_those_that_stay_go_but_for_what_else_is_in_their_folders(original, tmp_path, monkeypatch):
     out = tmp_path / "run"
 
     def probed(path, training, reference):
@@ -67,12 +58,12 @@ def test_the_oldest_of_those_that_stay_go_but_for_what_else_is_in_their_folders(
         save_checkpoint(path, training, reference)
 
     monkeypatch.setattr(command, "save_checkpoint", probed)
-    assert main(words(scene, out, "--keep-checkpoints", "2")) == 0
+    assert main(words(original, out, "--keep-checkpoints", "2")) == 0
     assert {path.parent.name for path in out.glob("step-*/checkpoint.pt")} == {"step-20", "step-25"}
     assert {path.name for path in out.glob("step-*")} == {"step-10", "step-20", "step-25"}
 
 
-def test_a_row_is_there_when_it_is_made_and_a_resumed_run_continues_the_file(scene, run, tmp_path, monkeypatch):
+def test_a_row_is_there_when_it_is_made_and_a_resumed_run_continues_the_file(original, run, tmp_path, monkeypatch):
     class Killed(BaseException):
         """Reported by no handler of errors."""
 
@@ -86,17 +77,17 @@ def test_a_row_is_there_when_it_is_made_and_a_resumed_run_continues_the_file(sce
     with monkeypatch.context() as patch:
         patch.setattr(command, "save_checkpoint", killed)
         with pytest.raises(Killed):
-            main(words(scene, out))
+            main(words(original, out))
     written = (out / "train.csv").read_text()
     assert [line.split(",")[0] for line in written.splitlines()] == ["step", "0", "10", "20"]
     (out / "train.csv").write_text(written + "2")  # of a line that was cut short
-    assert main(words(scene, out, "--resume")) == 0
+    assert main(words(original, out, "--resume")) == 0
     ended, whole = (pd.read_csv(each / "train.csv").drop(columns=["seconds", "cpu"]) for each in (out, run))
     pd.testing.assert_frame_equal(ended, whole, check_exact=True)
 
 
-def test_off_a_terminal_every_row_is_a_line_with_the_time_left(scene, tmp_path, capsys):
-    assert main(words(scene, tmp_path / "run")) == 0
+def test_off_a_terminal_every_row_is_a_line_with_the_time_left(original, tmp_path, capsys):
+    assert main(words(original, tmp_path / "run")) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("step ")]
     assert [line.split(":")[0] for line in lines] == [f"step {step} of 25" for step in (0, 10, 20, 25)]
     for line, (_, row) in zip(lines, pd.read_csv(tmp_path / "run" / "train.csv").iterrows(), strict=True):
@@ -104,21 +95,21 @@ def test_off_a_terminal_every_row_is_a_line_with_the_time_left(scene, tmp_path, 
         assert line.endswith(" s left") == (row["step"] in (10, 20))
 
 
-def test_gaussians_that_more_than_triple_in_the_first_tenth_are_said_with_the_reason(scene, tmp_path, capsys):
+def test_gaussians_that_more_than_triple_in_the_first_tenth_are_said_with_the_reason(original, tmp_path, capsys):
     fast = ["start=0", "every=1", "gradient_threshold=1e-9"]
     for name, settings in {"usual": fast[1:], "fast": fast}.items():
         changes = [word for setting in settings for word in ("--set", f"densify.{setting}")]
-        assert main(words(scene, tmp_path / name, *changes)) == 0
+        assert main(words(original, tmp_path / name, *changes)) == 0
         said = " ".join(capsys.readouterr().err.split())
         why = "more than 3 times those of the start: each of 2 rounds of density control since step 1 adds one for each"
         assert (why in said) == (name == "fast") and said.count("times those of the start") == (name == "fast")
 
 
-def test_tensorboard_is_given_the_rows(scene, tmp_path):
+def test_tensorboard_is_given_the_rows(original, tmp_path):
     reader = "tensorboard.backend.event_processing.event_accumulator"
     package = pytest.importorskip(reader, reason="pip install -e '.[tensorboard]'")
     out = tmp_path / "run"
-    assert main(words(scene, out, "--tensorboard")) == 0
+    assert main(words(original, out, "--tensorboard")) == 0
     events, table = package.EventAccumulator(str(out / "tensorboard")).Reload(), pd.read_csv(out / "train.csv")
     for name in ("loss", "psnr", "gaussians"):
         found = events.Scalars(name)
@@ -134,16 +125,18 @@ def test_tensorboard_is_given_the_rows(scene, tmp_path):
         (["--log-every", "0"], "expected log_every of at least 1, got 0"),
     ],
 )
-def test_what_cannot_be_done_is_refused_before_there_is_a_folder(scene, tmp_path, capsys, monkeypatch, more, message):
+def test_what_cannot_be_done_is_refused_before_there_is_a_folder(
+    original, tmp_path, capsys, monkeypatch, more, message
+):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    assert main(words(scene, tmp_path / "run", *more)) == 2
+    assert main(words(original, tmp_path / "run", *more)) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
-def test_a_train_csv_of_something_else_is_refused(scene, tmp_path, capsys):
+def test_a_train_csv_of_something_else_is_refused(original, tmp_path, capsys):
     out = tmp_path / "run"
-    assert main(words(scene, out)) == 0
+    assert main(words(original, out)) == 0
     (out / "train.csv").write_text("step,what\nfirst,2\n")
-    assert main(words(scene, out, "--resume")) == 2
+    assert main(words(original, out, "--resume")) == 2
     said = capsys.readouterr().err
     assert f"expected the rows of landscape train in {out / 'train.csv'}" in said and "remove it" in said

@@ -32,7 +32,6 @@ from analysis.train.remarks import (
 from landscape.errors import InputError
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import load_scene
-from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings
@@ -46,14 +45,6 @@ from splat.training.state import TrainConfig, Training
 from tests.splat.tiny import tiny_gaussians, tiny_views
 
 SIZE = (24, 18)
-
-
-@pytest.fixture(scope="module")
-def original(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("scenes") / "still"
-    settings = SyntheticSettings(gaussians=60, views=5, width=SIZE[0], height=SIZE[1])
-    write_transforms_scene(synthetic_scene(settings).scene, folder)
-    return folder
 
 
 def train(scene: Path, out: Path, *more: str) -> int:

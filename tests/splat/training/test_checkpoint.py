@@ -128,7 +128,7 @@ def test_a_file_that_the_system_does_not_open_is_reported_in_its_words(path, mon
     ],
     ids=lambda error: type(error).__name__,
 )
-@pytest.mark.parametrize("place", ["torch.load", "splat.training.checkpoint.Adam"])
+@pytest.mark.parametrize("place", ["torch.load", "splat.training.checkpoint.Adam", "zipfile.ZipFile"])
 def test_what_is_not_the_files_fault_is_never_called_damaged(path, monkeypatch, error, place):
     def fails(*_, **__):
         raise error
