@@ -29,19 +29,14 @@ from tests.recorded import soft, synthetic, written
 
 def test_an_index_of_which_only_a_bound_is_known_is_not_averaged(tmp_path):
     data, arrays = synthetic()
-    data["anisotropy"]["eigenvalue_ratio"] = {
-        "value": 7.0,
-        "low": 34.2,
-        "high": None,
-        "note": "lambda_min is not resolved",
-    }
+    data["anisotropy"]["eigenvalue_ratio"] = {"value": 7.0, "low": 34.2, "high": None, "note": "not resolved"}
     cell = Cell("still", "3dgs", TrainOptions(Path("still"), out=tmp_path / "0"))
     written(cell.out / "probe", data, arrays)
     (cell.out / "metrics.json").write_text(json.dumps({"test": {}, "train": {}, "gaussians": 9}))
     rows = results([cell], {cell.name: "done"})
-    assert rows.iloc[0]["eigenvalue_ratio_low"] == 34.2 and rows.iloc[0]["negative_ratio"] == pytest.approx(3.1e4 / 220)
+    assert rows.iloc[0]["eigenvalue_ratio_low"] == 34.2 and rows.iloc[0]["negative_ratio"] == pytest.approx(220 / 3.1e4)
     summary = summarize(rows)
-    assert summary["saddle_n"].item() == 1 and summary["literal_n"].item() == 0
+    assert summary["negative_ratio_n"].item() == 1 and summary["eigenvalue_ratio_n"].item() == 0
 
 
 def test_searches_that_ran_out_are_said_with_their_cells(tmp_path):
