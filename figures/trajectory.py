@@ -137,9 +137,11 @@ def _few_decades(axes: Axes) -> None:
 
 def _tick(value: float, _: int | None) -> str:
     """
-    >>> _tick(20.0, None), _tick(1e-5, None), _tick(5e-5, None)
-    ('20', '10⁻⁵', '5×10⁻⁵')
+    >>> _tick(20.0, None), _tick(1e-5, None), _tick(5e-5, None), _tick(0.0, None)
+    ('20', '10⁻⁵', '5×10⁻⁵', '')
     """
+    if value <= 0:  # which has no place
+        return ""
     exponent = math.floor(math.log10(value) + 1e-9)
     if -3 <= exponent <= 3:
         return f"{value:g}"
