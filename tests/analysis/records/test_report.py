@@ -19,10 +19,11 @@ from analysis.records.findings import findings
 from analysis.records.json_files import plain
 from analysis.records.quantities import exponent_of
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
-from analysis.records.report import interactive_surface, numbers, write_report
-from analysis.records.tables import family_table, probe_table
+from analysis.records.report import interactive_surface, write_report
+from analysis.records.tables import probe_table
 from figures.eye import eye_over
 from splat.training.origin.fingerprint import Fingerprint, ViewData
+from tests.analysis.records.test_findings import sentences
 from tests.recorded import depth_section, probe_of, soft, synthetic, written, written_map
 
 LEVEL = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -69,15 +70,6 @@ def page(folder, data, arrays, picture=None):
         path = write_report(partial)
         assert [p.name for p in partial.glob("*.tmp")] == []
     return (folder / path.name).read_text(encoding="utf-8")
-
-
-def sentences(data, level=None):
-    return " | ".join(line.text for line in findings(probe_of(data)) if level in {None, line.level})
-
-
-def estimated(value: float, error: float) -> dict[str, float]:
-    """Another value of a trace, and its interval."""
-    return {"value": value, "standard_error": error, "low": value - 2 * error, "high": value + 2 * error}
 
 
 def test_the_page_fetches_nothing_and_carries_its_pictures(tmp_path):
@@ -204,51 +196,6 @@ def test_every_picture_has_words_with_its_numbers(tmp_path):
     assert re.findall(r"<h(\d)", text) == sorted(re.findall(r"<h(\d)", text)) and text.count("<h1") == 1
 
 
-def test_the_five_numbers_carry_their_errors_and_one_without_bracket_is_none():
-    data, _ = synthetic()
-    found = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
-    assert found["largest curvature, λ max, per stored unit²"] == "(3.1000 ± 0.0012) × 10⁴"
-    assert found["most negative curvature, λ min, per stored unit²"] == "−220.0 ± 3.0"
-    assert found["trace of position, the largest of five in their own units"] == "(3.991 ± 0.093) × 10⁵"
-    assert found["λ max / |λ min|, of opposite signs"] == "140.9 ± 2.1"
-    data["anisotropy"]["eigenvalue_ratio"] |= {"value": -361.0, "low": 0.0, "high": None}
-    found = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
-    assert [value for words, value in found.items() if words.startswith("λ max / |λ min|")] == ["–"]
-    data["eigenvalues"]["min"] |= {"value": 5.0}
-    data["anisotropy"]["eigenvalue_ratio"] |= {"value": 6200.0, "low": 3900.0, "high": 15500.0}
-    found = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
-    assert found["smallest curvature, λ min, per stored unit²"] == "5.0 ± 3.0"
-    assert found["λ max / λ min (3900 … 1.55 × 10⁴)"] == "6200"
-
-
-def test_attributes_are_compared_by_the_optimisers_steps_where_their_intervals_are_apart():
-    data, _ = synthetic()
-    assert "optimiser" not in sentences(data)  # the record has no steps
-    data["steps"] = dict.fromkeys(data["traces"], 0.001)
-    data["steps"]["log_scales"] = 0.02
-    said, factor = sentences(data), 400 * data["traces"]["log_scales"]["value"] / data["traces"]["means"]["value"]
-    expected = f"a random step in log scale, as long as the optimiser's first, changes the loss {factor:.2g} times"
-    assert f"{expected} as much as one in position, the next." in said and "all absolute traces" not in said
-    tiles = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
-    assert tiles["the change of the loss by a step of the optimiser: log scale over position"] == f"{factor:.2g} : 1"
-    whole = data["traces"]["log_scales"]
-    data["traces"]["log_scales"] = whole | {"views_error": None}  # one of several views was measured
-    assert "optimiser" not in sentences(data)
-    width = 1e3 * whole["value"]  # not even the sign is known
-    data["traces"]["log_scales"] = whole | {"value": 0.0, "low": -width, "high": width, "sign": "undetermined"}
-    assert "optimiser" not in sentences(data)
-    data["traces"]["log_scales"] = whole
-    data["steps"]["log_scales"] = 7e-3  # the same change as of positions, within the errors
-    assert "optimiser" not in sentences(data) and "all absolute traces" in sentences(data)
-
-
-def test_an_indefinite_checkpoint_is_said_over_how_many_parameters_and_with_which_gradient():
-    data, _ = synthetic()
-    assert "over 136,682 parameters, with a gradient of norm 0.410, the curvature runs from" in sentences(data)
-    data["objective"]["gradient_norm"] = None
-    assert "over 136,682 parameters the curvature runs from" in sentences(data)
-
-
 def test_every_number_of_the_tables_is_on_the_page_with_its_error(tmp_path):
     data, arrays = synthetic()
     text = Page(page(tmp_path / "probe", data, arrays)).text
@@ -278,15 +225,6 @@ def test_the_page_sets_depth_against_the_papers_factor(tmp_path):
         "23,054 pairs",
     ):
         assert expected in text
-
-
-def test_of_depth_only_what_was_determined_is_said():
-    data, _ = synthetic()
-    undetermined = depth_section(None) | {"rises": []}
-    assert "along the rays" not in sentences(data | {"depth": undetermined})
-    open_ratio = depth_section() | {"curvature_ratio": {"value": None, "low": None, "high": None, "note": "why"}}
-    said = sentences(data | {"depth": open_ratio})
-    assert "(root mean square; the paper says about 100)." in said
 
 
 def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
@@ -329,116 +267,6 @@ def test_records_of_extreme_size_and_without_numbers_make_a_page(tmp_path, scale
     assert "not a number" in text and "The ends of the spectrum were not determined" in text
 
 
-def test_the_findings_names_the_attribute_that_carries_the_curvature():
-    data, _ = synthetic()
-    assert "Position carries most of the curvature" in sentences(data) and "98%" in sentences(data)
-    data["traces"]["quats"] |= estimated(-3.9e5, 4e4)
-    assert "Its error does not separate it from rotation" in sentences(data)
-    data["traces"]["quats"] |= estimated(-8e5, 4e3)
-    assert "Rotation carries most" in sentences(data) and "separate" not in sentences(data)
-
-
-def test_most_is_over_half_and_what_the_error_does_not_separate_is_named():
-    data, _ = synthetic()
-    data["traces"]["means"] |= estimated(4.1e5, 1e4)
-    data["traces"]["quats"] |= estimated(4e5, 4e4)
-    data["traces"]["sh"] |= estimated(-3.8e5, 4e4)
-    said = sentences(data)
-    assert "Position carries the largest part of the curvature" in said and "carries most" not in said
-    assert "does not separate it from rotation and colour (SH)." in said
-
-
-def test_attributes_have_no_order_where_an_error_is_not_known():
-    """That by the views left out is not, where one of several was measured."""
-    data, _ = synthetic()
-    assert not [line for line in summary(probe_of(data), Path()) if line.startswith("a step")]  # of a length not known
-    data["steps"] = dict.fromkeys(data["traces"], 0.001)
-    line = next(line for line in summary(probe_of(data), Path()) if line.startswith("a step"))
-    assert "in position changes the loss " in line and "times as much as in " in line and ", then " in line
-    for trace in data["traces"].values():
-        trace["views_error"] = None
-    line = next(line for line in summary(probe_of(data), Path()) if line.startswith("a step"))
-    assert " then " not in line and line.count(" ≈ ") == len(data["traces"]) - 1
-    assert "Its error does not separate it from" in sentences(data)
-
-
-def test_a_check_that_failed_leaves_no_number_that_it_puts_in_doubt():
-    data, _ = synthetic()
-    data["checks"]["finite_difference"] |= {"value": 20.3, "bound": 4.77e-4, "passed": False}
-    lines = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))
-    assert set(lines) == {"scene", "curvature", "checks", "report"}
-    assert lines["curvature"] == (
-        "the check of finite difference failed, which puts every curvature in doubt: none is told"
-    )
-    data["checks"]["finite_difference"]["passed"], data["checks"]["round_off"]["passed"] = True, False
-    assert "steepest" in {line.split()[0] for line in summary(probe_of(data), Path())}
-
-
-@pytest.mark.parametrize(
-    ("confirmed", "ratio", "said", "found"),
-    [
-        (True, 1.5, "renders agree from 0.0010 to 0.0040", "renders confirm it, so the checkpoint is no basin"),
-        (
-            False,
-            -1.5,
-            "not confirmed by renders: no saddle is claimed",
-            "renders do not confirm it: no saddle is claimed",
-        ),
-        (
-            None,
-            1.5,
-            "not resolved: round-off hides it in renders",
-            "round-off hides it in renders: no saddle is claimed",
-        ),
-    ],
-)
-@pytest.mark.parametrize("wide", [{}, {"wide": (4, -120.0, 14.0)}])
-def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, found, wide):
-    data, _ = synthetic()
-    rendered = {"steps": [1e-3, 2e-3, 4e-3], "optimiser_step": 2e-3, "ratios": [ratio] * 3, "errors": [0.1] * 3}
-    rendered |= {"confirmed": confirmed} | ({"low": 1e-3, "high": 4e-3} if confirmed else {})
-    data["eigenvalues"]["min"] |= {"value": -220.0, "residual": 1e-3, "reason": "tolerance", "renders": rendered}
-    data["eigenvalues"]["min"]["carrier"] = {
-        "gaussian": 3739, "share": 0.9, "attribute": "quats", "shape": "a needle, 158 : 1 in the picture",
-        "random_share": 0.002, "found": 10, **wide,
-    }  # fmt: skip
-    lines = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))
-    over = ", one training" if not confirmed else "330 over the optimiser's step, one training"
-    assert lines["negative"].startswith("−220 (" + over.removeprefix(", ").replace("330", "−330"))
-    who = "90% on Gaussian 3,739 (of a random direction 0.2%), a needle, 158 : 1 in the picture, turned; "
-    other = "none of the first 10 eigenvectors from this end lies on more than ten Gaussians"
-    other = "number 4 from this end (−120) is the first eigenvector on more than ten Gaussians" if wide else other
-    assert lines["negative"].endswith(f"{who}{other}; {said}")
-    assert found in sentences(data) and "λ max / λ min" not in str(lines)
-    assert ("times as curved as the steepest up" in sentences(data)) == (confirmed is True)
-    tiles = [each["words"] for each in numbers(probe_of(data))]
-    assert any(words.startswith("λ max / |λ min|") for words in tiles) == (confirmed is True)
-
-
-@pytest.mark.parametrize(
-    ("low", "residual", "words"),
-    [
-        (-220.0, 3.0, "The Hessian is indefinite"),
-        (-2.0, 3.0, "not decided by the residuals"),
-        (5.0, 3.0, "No direction of negative curvature was found"),
-    ],
-)
-def test_the_findings_calls_indefinite_what_the_residual_proves(low, residual, words):
-    data, _ = synthetic()
-    data["eigenvalues"]["min"] |= {"value": low, "residual": residual}
-    assert words in sentences(data)
-
-
-def test_the_findings_say_where_a_budget_ended_the_search_for_an_end():
-    data, _ = synthetic()
-    data["eigenvalues"]["min"] |= {"reason": "tolerance"}
-    assert "farther out" not in sentences(data)
-    data["eigenvalues"]["min"] |= {"reason": "time budget"}
-    assert "The search for the smallest eigenvalue ended at its time budget" in sentences(data, "caution")
-    data["eigenvalues"]["max"] |= {"reason": "matvec budget"}
-    assert "The search for the largest eigenvalue ended at its matvec budget" in sentences(data, "caution")
-
-
 def test_a_number_without_its_error_is_never_shown_as_exact(tmp_path):
     data, arrays = synthetic()
     data["traces"]["means"] |= {"value": 4e5, "standard_error": None, "sign": "undetermined"}
@@ -453,61 +281,6 @@ def test_a_failed_check_comes_first_and_in_red(tmp_path):
     first = findings(probe_of(data))[0]
     assert first.level == "failure" and "symmetry failed: 0.500" in first.text
     assert 'class="failure">The check of symmetry failed' in page(tmp_path / "probe", data, arrays)
-
-
-def test_the_findings_says_what_was_skipped_and_what_could_not_run():
-    said = sentences(synthetic()[0])
-    assert "217 of 10,091 Gaussians touch no pixel" in said
-    assert "degree 0 of 3" in said and "326 of the slice's 357 rendered points" in said
-    assert "finite difference could not run (every direction crosses a sort)" in said
-
-
-def test_the_findings_say_how_much_of_the_slice_is_interpolated():
-    data, _ = synthetic()
-    data["slice"] |= {"evaluated_points": 80, "crossed_points": 70, "interpolation_error": 0.004, "holdout_points": 30}
-    data["slice"] |= {"error_seen": 0.002, "tolerance": 0.01}
-    said = sentences(data)
-    assert "Of the slice's 357 points 80 are renders" in said
-    assert "interpolated to 1% of the range of the loss" in said
-    assert "(the error at 30 random points: at most 0.2%; the bound for all: 0.4%)" in said
-    assert "70 of the slice's 80 rendered points" in said
-    data["slice"] |= {"interpolation_error": None, "error_seen": None}
-    assert "30 random points: without bound" in sentences(data)
-    data["slice"]["resolved"] = False
-    assert "from 80 of 357 renders, and no surface is drawn; landscape slice" in sentences(data)
-
-
-def test_a_ratio_without_a_bound_is_not_determined():
-    data, _ = synthetic()
-    data["anisotropy"]["negative_ratio"] = {"value": None, "low": 0.0, "high": 0.02, "note": "not resolved"}
-    assert "times as curved" not in sentences(data) and "is not determined (not resolved)" in sentences(data)
-
-
-def test_the_ends_of_a_narrow_interval_are_told_apart():
-    data, _ = synthetic()
-    data["anisotropy"]["negative_ratio"] |= {"value": 2.602, "low": 2.6012, "high": 2.6034}
-    assert "(between 2.601 and 2.603)" in sentences(data)
-
-
-def test_a_share_and_its_bracket_have_the_same_unit():
-    data, _ = synthetic()
-    data["anisotropy"]["top_mass"] = {"value": 0.008, "low": 0.00627, "high": 0.00954, "note": ""}
-    assert "holds 0.80% of all absolute curvature (between 0.63% and 0.95%)." in sentences(data)
-
-
-def test_needles_are_counted_and_notes_are_sentences():
-    data, _ = synthetic()
-    data["eigenvalues"]["max"]["lives_on"] = {"needles": 0.78, "needle_count": 1, "participation": 1.8}
-    data["notes"] = ["the slice was left out"]
-    said = sentences(data)
-    assert "1 of 9,874 Gaussians in sight has a condition number above 100 and holds 78% of the steepest" in said
-    data["eigenvalues"]["max"]["lives_on"] |= {"needles": 0.004, "needle_count": 2}
-    assert "2 of 9,874 Gaussians in sight have a condition number above 100 and hold under 1% of the" in sentences(data)
-    data["eigenvalues"]["max"]["lives_on"] |= {"needles": 0.0, "needle_count": 0}
-    assert "None of 9,874 Gaussians in sight has a condition number above 100; the steepest direction" in sentences(
-        data
-    )
-    assert "The slice was left out." in said
 
 
 @pytest.mark.parametrize(
@@ -550,19 +323,6 @@ def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution
     assert "97.3" not in sentences(data) and "97.3" not in " ".join(summary(probe_of(data), Path()))
     data["anisotropy"]["negative_ratio"]["high"] = 0.0149
     assert not any(line.text.startswith("Negative ratio") for line in findings(probe_of(data)))
-
-
-def test_names_and_notes_that_look_like_markup_are_printed_as_they_are():
-    data, _ = synthetic()
-    data["checks"]["[/x]"] = data["checks"].pop("symmetry")
-    data["anisotropy"]["eigenvalue_ratio"]["note"] = "[/note]"
-    example = json.loads((Path(__file__).parent / "examples" / "probe.json").read_text())
-    data["per_attribute"] = [example["per_attribute"][0] | {"unit": "[/unit]", "block": "[/block]"}]
-    console = Console(width=140, file=StringIO())
-    record = probe_of(data)
-    console.print(probe_table(record, 140), family_table(record))
-    said = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
-    assert [word for word in ("[/x]", "[/note]", "[/unit]", "[/block]") if word not in said] == []
 
 
 def test_the_page_of_the_splats_is_linked_where_it_is(tmp_path):

