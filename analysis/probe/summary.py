@@ -88,7 +88,8 @@ def _end(end: Eigenvalue) -> str:
     if renders and (value > 0 or renders.confirmed):
         at = renders.at_step
         over = "hidden by round-off" if at is None else rough(at * value)
-        notes.insert(0, f"{over} over the optimiser's step")
+        kinks = f", where kinks of L1 add {rough(renders.kinks)}" if renders.kinks else ""
+        notes.insert(0, f"{over} over the optimiser's step{kinks}")
     text = f"{solved(value, end.residual)}{apart(end.views_error)} ({', '.join(notes)})"
     return f"{text}{_carrier(end)}; {_rendered(end)}"
 
