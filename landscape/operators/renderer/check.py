@@ -88,7 +88,8 @@ def check_renderer(hessian: RendererHessian, generator: torch.Generator) -> Rend
     []
     """
     V = _vectors(hessian, generator)
-    stated, length = hessian.error(V[:, :1]), torch.linalg.vector_norm(hessian.apply(V[:, :1]).double())
+    product, stated = hessian.measured(V[:, :1])
+    length = torch.linalg.vector_norm(product.double())
     once, again = (gradient_ratios(hessian, V[:, 1:], factor) for factor in (1.0, 2.0))
     ratios = {
         name: (a - 1, abs(a - b))
@@ -107,8 +108,8 @@ def check_renderer(hessian: RendererHessian, generator: torch.Generator) -> Rend
 
 def require_resolved(hessian: RendererHessian, generator: torch.Generator) -> float:
     """The error of a product with a random unit vector.  Raises InputError where it is as long as the product."""
-    v = _vectors(hessian, generator)[:, :1]
-    error, length = float(hessian.error(v).total), float(torch.linalg.vector_norm(hessian.apply(v).double()))
+    product, stated = hessian.measured(_vectors(hessian, generator)[:, :1])
+    error, length = float(stated.total), float(torch.linalg.vector_norm(product.double()))
     if length and not error < UNRESOLVED * length:
         raise InputError(
             f"expected products that steps resolve, got an error of {error / length:.0%} of the length of H v; check_renderer "
@@ -120,12 +121,12 @@ def require_resolved(hessian: RendererHessian, generator: torch.Generator) -> fl
 def gradient_ratios(hessian: RendererHessian, V: Tensor, factor: float = 1.0) -> list[float | None]:
     """v . J^T (J v) / |J v|^2 over all views, of each column; None where no view changes.  1 for the gradient of the image."""
     pulled, squares = torch.zeros(2, V.shape[1], dtype=torch.float64)
-    with hessian.parameters.restored() as here:
+    with hessian.at_point():
         for index in range(len(hessian.views)):
             view = hessian.linear(index)
             for j, v in enumerate(V.unbind(dim=1)):
-                if h := hessian.step(index, view, here, v):
-                    Jv, _ = hessian.change_of_image(index, view, here, v, factor * h)
+                if h := hessian.step(index, view, v):
+                    Jv = hessian.change_of_image(index, view, v, factor * h)[0]
                     back = hessian.parameters.vjp(view.image, Jv, keep=True)
                     pulled[j] += float(torch.dot(back.double(), v.double()))
                     squares[j] += float(Jv.double().square().sum())

@@ -22,7 +22,8 @@ with an error like |dI| / |I|.  Both are equal at |dI| = sqrt(u) |I|.  The noise
 takes the place of u where it is larger.  TRIALS renders of the first view that v changes find h.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from math import isfinite, nan, sqrt
@@ -41,6 +42,7 @@ from landscape.results import ShortRepr
 TRIALS = 2  # renders that find a step
 FACTOR = 1e4  # by which one of them changes it at most
 ROUNDING = 1 / 4  # mean error of a rounded number, in units of eps
+KEPT = 1 << 30  # bytes of J^T g of the views; of views beyond it costs a backward pass in each product
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -122,7 +124,7 @@ class RendererHessian:
     >>> H.apply(torch.eye(2, dtype=torch.float64)).diagonal() / (2 * torch.exp(2 * x.detach()))  # e^2x / 2, twice
     tensor([1.0000, 1.0000], dtype=torch.float64)
     >>> H.passes(vectors=1), H.gauss_newton.passes(vectors=1)
-    ((8, 8), (8, 2))
+    ((8, 6), (8, 2))
     """
 
     def __init__(
@@ -140,12 +142,17 @@ class RendererHessian:
         self.render, self.loss, self.views, self.curved = render, loss, views, True
         self.parameters = Parameters(parameters)
         self.dim, self.dtype, self.blocks = self.parameters.dim, self.parameters.dtype, self.parameters.blocks
-        gradient = torch.zeros(self.dim, dtype=torch.float64, device=self.parameters.device)
-        losses, seen = [], 0.0
+        self.point = self.parameters.flat
+        gradient = torch.zeros(self.dim, dtype=torch.float64, device=self.point.device)
+        room = int(KEPT / (self.point.numel() * self.point.element_size()))
+        losses, seen, self.still = [], 0.0, []  # J^T g of the first views
         for index in range(len(views)):
             linear = self.linear(index)
-            gradient += self.parameters.vjp(linear.image, linear.gradient.detach())
+            still = self.parameters.vjp(linear.image, linear.gradient.detach())
+            gradient += still
             losses.append(linear.loss)
+            if index < room:
+                self.still.append(still)
             if index == 0:
                 seen = rms(self.image(0, linear.image) - linear.image) / sqrt(2) / (rms(linear.image) or 1.0)
         self.value, self.gradient = sum(losses) / len(losses), (gradient / len(views)).to(self.dtype)
@@ -165,8 +172,9 @@ class RendererHessian:
 
     def passes(self, vectors: int) -> tuple[int, int]:
         """Renders and backward passes of a product with so many vectors, if the first view sees them; else at most."""
-        views, once = len(self.views), 1 + 3 * vectors
-        return views * (1 + 2 * vectors) + TRIALS * vectors, views * (once if self.curved else vectors)
+        views, pulled = len(self.views), (3 if self.curved else 1) * vectors
+        more = views - len(self.still) if self.curved else 0
+        return views * (1 + 2 * vectors) + TRIALS * vectors, views * pulled + more
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         require_vectors(V, self.dim, self.dtype)
@@ -174,6 +182,10 @@ class RendererHessian:
 
     def error(self, V: Float[Tensor, "n k"]) -> ProductErrors:
         """Errors of the products with these vectors, for two products with each, and a third where there is noise."""
+        return self.measured(V)[1]
+
+    def measured(self, V: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n k"], ProductErrors]:
+        """H V and its errors."""
         lengths = column_lengths(V, "vectors")
         HV, kinks, _ = self.products(V)
         once = HV.double()
@@ -183,7 +195,7 @@ class RendererHessian:
             noise = torch.linalg.vector_norm(once - self.products(V)[0], dim=0) / sqrt(2)
         require_finite(self, bool(torch.isfinite(longer + noise).all()))
         forms, pairs = gram(V, once) / lengths[:, None] / lengths, len(lengths) * (len(lengths) - 1)
-        return ProductErrors(longer, noise, kinks, float((forms - forms.T).norm()) / sqrt(pairs) if pairs else nan)
+        return HV, ProductErrors(longer, noise, kinks, float((forms - forms.T).norm()) / sqrt(pairs) if pairs else nan)
 
     def loss_at(self, theta: Float[Tensor, " n"]) -> Float64[Tensor, ""]:
         """The mean loss at other parameters, for slices and finite steps: one render of each view.
@@ -222,62 +234,68 @@ class RendererHessian:
         """H V, the share of |J v|^2 in kinked pixels, and the steps h, which are `factor` times as long as they should be."""
         total, kinks = torch.zeros_like(V), torch.zeros(2, V.shape[1], dtype=torch.float64)
         steps = [0.0] * V.shape[1]
-        with self.parameters.restored() as here:
+        with self.at_point():
             for index in range(len(self.views)):
                 view = self.linear(index)
-                still = self.parameters.vjp(view.image, view.gradient.detach(), keep=True) if self.curved else here
+                still = self.still[index] if index < len(self.still) else self.point
+                if self.curved and still is self.point:
+                    still = self.parameters.vjp(view.image, view.gradient.detach(), keep=True)
                 for j, v in enumerate(V.unbind(dim=1)):
-                    steps[j] = steps[j] or self.step(index, view, here, v)
+                    steps[j] = steps[j] or self.step(index, view, v)
                     if steps[j]:  # else the view does not see v
-                        Hv, Jv, apart = self._product(index, view, still, here, v, factor * steps[j])
+                        Hv, Jv, apart = self._product(index, view, still, v, factor * steps[j])
                         total[:, j] += Hv
                         squares = Jv.double().square()
                         kinks[:, j] += torch.stack([squares[apart].sum(), squares.sum()]).cpu()
         lengths = factor * torch.tensor(steps, dtype=torch.float64)
         return total / len(self.views), kinks[0] / kinks[1].clamp_min(1e-300), lengths
 
-    def step(self, index: int, view: LinearView, here: Tensor, v: Tensor) -> float:
+    @contextmanager
+    def at_point(self) -> Iterator[None]:
+        """Bring the parameters back in the end.  InputError where they are not those that the operator was made at."""
+        with self.parameters.restored() as here:
+            if not torch.equal(here, self.point):
+                raise InputError(
+                    "expected the parameters that the operator was made at, got others; make one after each step"
+                )
+            yield
+
+    def step(self, index: int, view: LinearView, v: Tensor) -> float:
         """The step h along v; 0 where it does not change the image."""
         largest, target = float(v.abs().max()), self.change * (rms(view.image) or 1.0)
-        h = self.change * (float(here.abs().max()) or 1.0) / largest if largest else 0.0
+        h = self.change * (float(self.point.abs().max()) or 1.0) / largest if largest else 0.0
         for _ in range(TRIALS if largest else 0):
-            self.parameters.write(here.double() + h * v.double())
+            self.parameters.write(self.point.double() + h * v.double())
             change = rms(self.image(index, view.image) - view.image)
             h *= min(max(target / change, 1 / FACTOR), FACTOR) if change else 0.0
-        self.parameters.write(here)
+        self.parameters.write(self.point)
         return h
 
     def change_of_image(
-        self, index: int, view: LinearView, here: Tensor, v: Tensor, h: float
-    ) -> tuple[Tensor, Bool[Tensor, "..."]]:
-        """J v of one view, for two renders, and where its one-sided differences disagree."""
-        images = []
-        for step in (h, -h):
-            self.parameters.write(here.double() + step * v.double())
-            images.append(self.image(index, view.image))
-        self.parameters.write(here)
-        middle = view.image.detach()
-        return one_sided((images[0] - middle) / h, (middle - images[1]) / h)
-
-    def _product(
-        self, index: int, view: LinearView, still: Tensor, here: Tensor, v: Tensor, h: float
-    ) -> tuple[Tensor, Tensor, Bool[Tensor, "..."]]:
-        """H_m v of one view, J v, and where its one-sided differences disagree.  still: J^T g."""
-        if not self.curved:
-            Jv, apart = self.change_of_image(index, view, here, v, h)
-            return self.parameters.vjp(view.image, view.curvature(Jv), keep=True), Jv, apart
+        self, index: int, view: LinearView, v: Tensor, h: float, cotangent: Tensor | None = None
+    ) -> tuple[Tensor, Bool[Tensor, "..."], list[Tensor]]:
+        """J v of one view, for two renders, where its one-sided differences disagree, and J+^T and J-^T of a cotangent."""
         images, pulled = [], []
         for step in (h, -h):
-            self.parameters.write(here.double() + step * v.double())
-            with torch.enable_grad():
+            self.parameters.write(self.point.double() + step * v.double())
+            with torch.set_grad_enabled(cotangent is not None):
                 image = self.render(self.views[index])
             images.append(_alike(image, view.image, index))
-            pulled.append(self.parameters.vjp(image, view.gradient.detach()))
-        self.parameters.write(here)
+            if cotangent is not None:
+                pulled.append(self.parameters.vjp(image, cotangent))
+        self.parameters.write(self.point)
         middle = view.image.detach()
-        Jv, apart = one_sided((images[0] - middle) / h, (middle - images[1]) / h)
-        turning = one_sided((pulled[0] - still) / h, (still - pulled[1]) / h)[0]
-        return self.parameters.vjp(view.image, view.curvature(Jv), keep=True) + turning, Jv, apart
+        return *one_sided((images[0] - middle) / h, (middle - images[1]) / h), pulled
+
+    def _product(
+        self, index: int, view: LinearView, still: Tensor, v: Tensor, h: float
+    ) -> tuple[Tensor, Tensor, Bool[Tensor, "..."]]:
+        """H_m v of one view, J v, and where its one-sided differences disagree.  still: J^T g."""
+        Jv, apart, pulled = self.change_of_image(index, view, v, h, view.gradient.detach() if self.curved else None)
+        product = self.parameters.vjp(view.image, view.curvature(Jv), keep=True)
+        if self.curved:
+            product += one_sided((pulled[0] - still) / h, (still - pulled[1]) / h)[0]
+        return product, Jv, apart
 
 
 def _require_image(image: object, index: int) -> None:

@@ -100,6 +100,24 @@ def test_products_cost_the_passes_that_are_stated():
         assert (bumps.renders, len(pulled)) == operator.passes(vectors=2)
 
 
+def test_without_memory_for_the_gradients_of_views_products_are_the_same_for_a_pass_more(monkeypatch):
+    kept = Bumps().hessian()
+    assert kept.passes(vectors=1) == (3 * 3 + 2, 3 * 3)
+    monkeypatch.setattr(renderer, "KEPT", 24 * 8)  # one view
+    fewer, V = Bumps().hessian(), vectors(24)
+    assert torch.equal(fewer.apply(V), kept.apply(V)) and fewer.passes(vectors=1) == (3 * 3 + 2, 3 * 3 + 2)
+
+
+def test_products_at_other_parameters_are_refused():
+    bumps = Bumps()
+    H = bumps.hessian()
+    with torch.no_grad():
+        bumps.named["depths"] += 1e-3
+    for operator in (H, H.gauss_newton):
+        with pytest.raises(InputError, match="parameters that the operator was made at"):
+            operator.apply(vectors(24))
+
+
 def test_jumps_of_the_image_are_left_out(monkeypatch):
     """Weights under 0.3 are dropped.  With central differences, the products at the same steps are all jumps."""
     H, exact = Bumps(torch.float32, cut=0.3).hessian(noise=3e-6), Bumps(cut=0.3).exact()
