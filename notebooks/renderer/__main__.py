@@ -1,7 +1,7 @@
 """The bridge to other people's renderers, measured on our own: `python -m notebooks.renderer [RUN ...] [--out TABLE.csv]`.
 
-A synthetic scene (`demo`) in float64 and float32, then each RUN, a folder of `landscape train`, in float32: the rasteriser gives images and
-their gradients, and the exact operators are the truth.  The table (columns: `notebooks.renderer.measure`) is written after each
+A synthetic scene (`demo`) in float64 and float32, then each RUN, a folder of `landscape train`, in float32: the rasteriser
+gives images and their gradients, and the exact operators are the truth.  The table (columns: `notebooks.renderer.measure`) is written after each
 part; what it has of a scene and part is not measured again, so the same command goes on.  Last it prints the table of
 docs/why-finite-differences-fail.md.
 
@@ -25,7 +25,7 @@ from analysis.console.plain import say
 from analysis.records.provenance import provenance
 from notebooks.renderer.measure import Row, Sizes, best_step, ends, products, traces
 from notebooks.renderer.scenes import Scene, demo, trained
-from splat.training.checkpoint import write_atomically
+from splat.model.untrusted import write_atomically
 
 RESULTS = Path(__file__).parents[1] / "results" / "renderer.csv"
 COLUMNS = (

@@ -13,7 +13,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from analysis.records.run_files import CHECKPOINT
 from landscape import RendererHessian
 from splat import (
     Gaussians,
@@ -24,7 +23,7 @@ from splat import (
     TrainConfig,
     Training,
     initial_gaussians,
-    load_checkpoint,
+    open_subject,
     synthetic_scene,
     train,
 )
@@ -99,12 +98,10 @@ def demo(gaussians: int = 100, width: int = 40, height: int = 30, steps: int = 1
 
 def trained(run: Path) -> Scene:
     """The scene of a training, at its checkpoint, with its views and its loss."""
-    path = run / CHECKPOINT if run.is_dir() else run
-    checkpoint = load_checkpoint(path)
-    views = checkpoint.load_scene(path).load(checkpoint.scene.train)
-    training = checkpoint.training
+    subject = open_subject(run)
+    training, views = subject.checkpoint.training, subject.scene.load(subject.checkpoint.scene.train)
     objective = SceneObjective(training.gaussians.to(torch.float64), views, training.config.loss)
-    return Scene(path.parent.name, objective, torch.float32)
+    return Scene(run.name, objective, torch.float32)
 
 
 def directions(blocks: dict[str, slice], dim: int, each: int) -> tuple[list[str], Tensor]:
