@@ -69,7 +69,7 @@ GROUPS = {  # as a person works
     "measure": {
         "probe": Command(
             ProbeOptions,
-            "analysis.probe.command:run_probe",
+            "analysis.commands.uses.renderer:run_any_probe",
             "runs/fern",
             recorded=True,
             draws="make_all",

@@ -1,9 +1,9 @@
 """The bridge to other people's renderers, measured on our own: `python -m notebooks.renderer [RUN ...] [--out TABLE.csv]`.
 
 A synthetic scene (`demo`) in float64 and float32, then each RUN, a folder of `landscape train`, in float32: the rasteriser
-gives images and their gradients, and the exact operators are the truth.  The table (columns: `notebooks.renderer.measure`) is written after each
-part; what it has of a scene and part is not measured again, so the same command goes on.  Last it prints the table of
-docs/why-finite-differences-fail.md.
+gives images and their gradients, and the exact operators are the truth.  The table (columns: `notebooks.renderer.measure`) is
+written after each part; what it has of a scene and part is not measured again, so the same command goes on.  Last it prints
+the tables of docs/why-finite-differences-fail.md.
 
     landscape train data/fern --views 3 --iterations 2000 --seed 0 --out runs/fern
     python -m notebooks.renderer runs/fern --each 3 --seeds 2 --cover 0 --out notebooks/results/renderer.csv
