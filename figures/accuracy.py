@@ -17,6 +17,7 @@ from matplotlib.ticker import NullFormatter
 from analysis.console.failures import program
 from figures.scripts import table_script
 from figures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, literal, new_figure, style
+from splat.model.untrusted import read_table
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, "0.45", BLACK, "saddlebrown", "olive")
 LINES = {"own": ("-", "o"), "peer": ("--", "^")}
@@ -79,7 +80,7 @@ def _panel(axes: Axes, part: pd.DataFrame, looks: dict[tuple[str, str], tuple[st
 
 def draw_all(path: Path) -> Iterator[tuple[str, Figure]]:
     """A figure for each quantity of accuracy.csv, and the name of its file."""
-    table = pd.read_csv(path)
+    table = read_table(path)
     for quantity in table["quantity"].unique():
         words = "".join(c if c.isalpha() else "_" for c in quantity).strip("_")
         yield f"accuracy_{words}", draw(table, quantity)

@@ -27,7 +27,7 @@ from figures.style import (
     style,
 )
 from landscape.errors import InputError
-from splat.model.untrusted import read_arrays
+from splat.model.untrusted import read_arrays, read_table
 
 SCORES = {
     "removal_error": ("removal error, loss", VERMILION),
@@ -122,7 +122,7 @@ def draw(folder: Path, suffix: str = "png") -> list[Path]:
             f"expected what landscape prune --curve, next-view or uncertainty writes in {folder}, found none"
         )
     return [save(draw_uncertainty(path), path.with_suffix(f".{suffix}")) for path in views] + [
-        save(PICTURES[name](pd.read_csv(folder / f"{name}.csv")), folder / f"{name}.{suffix}") for name in tables
+        save(PICTURES[name](read_table(folder / f"{name}.csv")), folder / f"{name}.{suffix}") for name in tables
     ]
 
 

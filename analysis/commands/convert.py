@@ -129,7 +129,7 @@ def _to_depths(options: ConvertOptions) -> list[str]:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, content.getvalue())
     again = arguments("train", _with_depths(checkpoint.scene, scene, options.out))
-    return [f"depth of {len(views)} views: {shlex.join(['landscape', *again])}"]
+    return [f"depth of {len(views)} views: {shlex.join(['landscape', *again])}", *checkpoint.assumptions]
 
 
 def _with_depths(reference: SceneReference, scene: Scene, depths: Path) -> TrainOptions:

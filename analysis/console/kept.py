@@ -19,9 +19,10 @@ import torch
 from torch import Tensor
 
 from analysis.console.stages import Stages
+from landscape.errors import InputError
 from landscape.probes import spawn
 from landscape.results import Progress
-from splat.training.checkpoint import write_atomically
+from splat.model.untrusted import unpacked, write_atomically
 
 T = TypeVar("T")
 DIGEST = sha256().digest_size
@@ -120,11 +121,11 @@ class Kept:
     def _read(self, name: str, kind: type[T]) -> tuple[T, Entry] | None:
         """What a stage found; None where nothing that can be read and is this command's is kept."""
         if self.folder is not None and (file := _file(self.folder, name)).is_file():
-            with suppress(OSError, msgspec.DecodeError):
+            with suppress(OSError, InputError):
                 content = (kept := file.read_bytes())[DIGEST:]
                 if kept[:DIGEST] == self._digest(content):
-                    entry = msgspec.msgpack.decode(content, type=Entry)
-                    return msgspec.msgpack.decode(entry.value, type=kind, dec_hook=_tensor), entry
+                    entry = unpacked(content, Entry)
+                    return unpacked(entry.value, kind, _tensor), entry
         return None
 
     def _digest(self, content: bytes) -> bytes:

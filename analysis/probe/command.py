@@ -103,7 +103,7 @@ def _run(
         data.steps = lengths
         if families is not None:
             data = _with_families(data, arrays, families, objective, checkpoint, generator, stages, found.ends)
-        data.notes += [*scene.notes, *checkpoint.assumptions]
+        data.notes += checkpoint.assumptions
         if folder is not None:
             _write(folder, data, arrays, objective, stages, start, drawn)
     if writes:

@@ -23,7 +23,7 @@ from analysis.records.provenance import Machine, Provenance
 from analysis.records.quantities import Shade
 from analysis.records.schema import INDICES, Count, NonNegative, Number, Portion
 from landscape.errors import InputError
-from splat.model.untrusted import NAME, read_arrays
+from splat.model.untrusted import NAME, read_arrays, read_table
 from splat.training.origin.fingerprint import Fingerprint
 
 if TYPE_CHECKING:
@@ -259,10 +259,7 @@ def read_trajectory(path: Path) -> "pd.DataFrame":
     """The rows of a trajectory, whose columns ALWAYS and NUMBERS hold numbers.  InputError names the file and the column."""
     import pandas as pd  # a third of a second of imports
 
-    try:
-        table = pd.read_csv(path)
-    except (ValueError, OverflowError) as error:  # pandas names no file
-        raise InputError(f"expected {_TRAJECTORY} in {path}, got {error}") from None
+    table = read_table(path, _TRAJECTORY)
     for name in ("state", *ALWAYS, *NUMBERS):
         if name not in table:
             raise InputError(f"expected {_TRAJECTORY} in {path}, got no column {name}")

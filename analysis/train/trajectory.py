@@ -59,8 +59,8 @@ from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, block_traces, exact_traces
+from splat.model.untrusted import read_table, write_atomically
 from splat.scenes.view import View
-from splat.training.checkpoint import write_atomically
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.origin.subject import Checkpoint
 from splat.training.state import Training
@@ -227,7 +227,7 @@ def _read_rows(path: Path, step: int) -> list[Row]:
     """Rows up to a step, as text, so that they are written again unchanged."""
     if not path.is_file():
         return []
-    table, text = read_trajectory(path), pd.read_csv(path, dtype=str, na_filter=False)
+    table, text = read_trajectory(path), read_table(path, dtype=str, na_filter=False)
     rows: list[Row] = [dict(zip(text, row, strict=True)) for row in text.itertuples(index=False)]
     kept = zip(rows, table["step"], table["seconds"], strict=True)
     return [row | {"seconds": float(seconds)} for row, at, seconds in kept if at <= step]

@@ -6,6 +6,7 @@ from pathlib import Path
 import pandas as pd
 
 from landscape.errors import InputError
+from splat.model import untrusted
 
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
@@ -15,10 +16,8 @@ TEXTS = ("scene", "method", "size", "date", "machine", "commit", *REASONS)  # co
 
 def read_table(path: Path) -> pd.DataFrame:
     """The rows of a table FILE.  Raises InputError where a column is missing or has other than numbers."""
-    try:
-        table = pd.read_csv(path, dtype=dict.fromkeys(TEXTS, str), keep_default_na=False, na_values=[""])
-    except (ValueError, OverflowError) as error:  # pandas names no file
-        raise InputError(f"expected the table of a study in {path}, got {error}") from None
+    texts = dict.fromkeys(TEXTS, str)
+    table = untrusted.read_table(path, "the table of a study", dtype=texts, keep_default_na=False, na_values=[""])
     if missing := [key for key in KEYS if key not in table]:
         raise InputError(f"expected the table of a study in {path}, got one without the column {missing[0]}")
     for name in table.columns.difference(TEXTS):

@@ -27,7 +27,7 @@ from figures.style import save
 from landscape.errors import InputError
 from notebooks.second_order.curves import against, curve
 from notebooks.second_order.figure import draw_scene
-from splat.training.checkpoint import write_atomically
+from splat.model.untrusted import read_table, write_atomically
 
 RESULTS = Path(__file__).parents[1] / "results" / "second-order"
 CURVE, CURVES = "curve.csv", "curves.csv"
@@ -57,14 +57,14 @@ def curves(runs: Path) -> pd.DataFrame:
     ended = sorted(path.parent for path in runs.glob("*/*/*/metrics.json"))
     if not ended:
         if (runs / CURVES).is_file():
-            return pd.read_csv(runs / CURVES)
+            return read_table(runs / CURVES)
         raise InputError(f"expected runs that have ended in {runs}, got none; landscape sweep makes them")
     for run in track([run for run in ended if not (run / CURVE).is_file()], "curves", console=Console(stderr=True)):
         write_atomically(run / CURVE, curve(run).to_csv(index=False).encode())
     tables = []
     for run in ended:
         scene, method, seed = run.parts[-3:]
-        tables.append(pd.read_csv(run / CURVE).assign(scene=scene, method=method, seed=seed))
+        tables.append(read_table(run / CURVE).assign(scene=scene, method=method, seed=seed))
     table = pd.concat(tables, ignore_index=True)
     write_atomically(runs / CURVES, table.to_csv(index=False).encode())
     return table

@@ -16,6 +16,7 @@ import pandas as pd
 
 from analysis.records.run_files import CHECKPOINT
 from landscape.errors import InputError
+from splat.model.untrusted import read_table
 from splat.scenes.view import View
 from splat.training.checkpoint import load_checkpoint, open_subject
 from splat.training.score.evaluate import evaluate
@@ -26,7 +27,7 @@ OF_ADAM = 2  # forward and backward
 
 def curve(run: Path) -> pd.DataFrame:
     """The rows of a run that has ended.  InputError where it kept no checkpoints or logged none of their steps."""
-    log = pd.read_csv(run / LOG).set_index("step")
+    log = read_table(run / LOG).set_index("step")
     kept = sorted((int(path.parent.name.removeprefix("step-")), path) for path in run.glob(f"step-*/{CHECKPOINT}"))
     if not kept:
         raise InputError(f"expected checkpoints along {run}, found none; train with --keep-checkpoints all")
@@ -68,7 +69,7 @@ def _passes(run: Path) -> "pd.Series | None":
     """Passes of each step, where the method counts them."""
     if not (run / HISTORY).is_file():
         return None
-    return pd.read_csv(run / HISTORY).get("passes")
+    return read_table(run / HISTORY).get("passes")
 
 
 def against(table: pd.DataFrame, reference: str) -> pd.DataFrame:

@@ -14,14 +14,14 @@ import re
 import shutil
 import tomllib
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
-from io import BytesIO
+from io import BufferedReader, BytesIO, FileIO, StringIO
 from math import prod
 from pathlib import Path
-from typing import IO, Any, BinaryIO, cast
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -30,6 +30,10 @@ from PIL import Image
 
 from landscape.errors import InputError
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+T = TypeVar("T")
 EXPANSION = 32  # times its size on disk that an archive may hold; what this program writes is not compressed
 LFS_MAGIC = b"version https://git-lfs"
 SLACK = 2**20  # bytes that any archive may hold
@@ -37,6 +41,7 @@ FOLDER = 0x10  # among the attributes of a member
 MOST_TEXT = 2**28  # bytes of a file of text
 DEEPEST = 64  # levels of lists and mappings in one; records have at most ten, and Python takes about 300
 MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
+MOST_ROWS = 2**16  # more than JPEG has; Pillow keeps an address for each, which may be more than the pixels
 NAME = r"^[\w+-][\w.+ -]{0,99}$"  # of a file in a record, or that becomes a folder: letters, digits, - _ + . and blanks
 LONGEST = 200  # bytes of a name to which more may be added
 UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR)  # of a folder to write in
@@ -181,11 +186,51 @@ def read_toml(path: Path, what: str = "TOML") -> dict[str, Any]:
         return _shallow(tomllib.loads(_bytes(path).decode("utf-8")))
 
 
+def read_table(path: Path, what: str = "a table", **settings: Any) -> "pd.DataFrame":
+    """What `pandas.read_csv` reads with these settings.  InputError, which says what was expected, where it is no CSV."""
+    import pandas as pd  # a third of a second
+
+    with _refusing(what, path):
+        return pd.read_csv(StringIO(_bytes(path).decode("utf-8")), **settings)
+
+
+def unpacked(content: bytes | msgspec.Raw, kind: type[T], decode_hook: Callable[[type, Any], Any] | None = None) -> T:
+    """A structure that `msgspec.msgpack` wrote.  InputError where the content is of another kind, or too deep."""
+    try:
+        return msgspec.msgpack.decode(content, type=kind, dec_hook=decode_hook)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"expected {kind.__name__}, got {error}") from None
+
+
+class ImageFile(BufferedReader):
+    """A file that is never asked for more bytes than it has: a chunk of a PNG may announce 2 GiB."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(FileIO(path))
+        self.size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1) -> bytes:
+        left = max(self.size - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+    def __repr__(self) -> str:  # in Pillow's messages
+        return repr(self.name)
+
+
+def open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
+    """A picture, of which the size alone has been read.  InputError where it has more than MOST_PIXELS or MOST_ROWS.
+
+    formats: Pillow recognises a file by its content, whatever its name, and would start Ghostscript for PostScript.
+    """
+    image = Image.open(file, formats=formats)
+    if image.width * image.height > MOST_PIXELS or max(image.size) > MOST_ROWS:
+        raise InputError(f"{image.width} x {image.height} px (at most {MOST_PIXELS:,} and {MOST_ROWS:,} a side)")
+    return image
+
+
 def read_picture(path: Path) -> Image.Image:
-    """A PNG or JPEG.  InputError where it is none, or has more than MOST_PIXELS."""
-    with _refusing("a picture", path), Image.open(path, formats=("PNG", "JPEG")) as image:
-        if image.width * image.height > MOST_PIXELS:
-            raise InputError(f"{image.width} x {image.height} pixels, of at most {MOST_PIXELS:,}")
+    """A PNG or JPEG.  InputError where it is none, or too large."""
+    with _refusing("a picture", path), ImageFile(path) as content, open_image(content, ("PNG", "JPEG")) as image:
         image.load()
         return image
 

@@ -10,8 +10,6 @@ A file is found by the photograph's name, with its suffix replaced or followed b
 scene (`train/r_3` in `train/r_3.npy` or `r_3.npy`); the masks of DTU by the number of the view.
 """
 
-import io
-import os
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -25,17 +23,14 @@ from PIL import Image
 from torch import Tensor
 
 from landscape.errors import InputError
-from splat.model.untrusted import read_array, require_content
+from splat.model.untrusted import ImageFile, open_image, read_array, require_content
 from splat.scenes.view import View
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".npy", ".png")
 MASK_FOLDERS = ("mask", "masks")
 SIXTEEN_BITS = ("I;16", "I;16B", "I")
-# Pillow recognises a file by its content, whatever its name, and would start Ghostscript for PostScript
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
-MOST_ROWS = 2**16  # more than JPEG has; Pillow keeps an address for each, which may be more than the pixels
 UNCLEAR = (0.25, 0.75)  # of the largest value: what has a colour above the one and another below the other is neither
 MOST_UNCLEAR = 0.1  # of the pixels that are not black; edges of a mask, and JPEG's noise round them, are less
 MOST_LABELS = 64  # a larger number than 1 up to here counts objects
@@ -44,33 +39,18 @@ STRIP = 256  # rows of a mask at a time: a large one would take a GB in all its 
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
 
 
-class _File(io.BufferedReader):
-    """A file that is never asked for more bytes than it has: a chunk of a PNG may announce 2 GiB."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path))
-        self.size = os.fstat(self.fileno()).st_size
-
-    def read(self, size: int | None = -1) -> bytes:
-        left = max(self.size - self.tell(), 0)
-        return super().read(left if size is None or size < 0 else min(size, left))
-
-    def __repr__(self) -> str:  # in Pillow's messages
-        return repr(self.name)
-
-
 @contextmanager
 def opened_image(path: Path, kind: str = "an image") -> Iterator[Image.Image]:
     """An image file, open.  InputError that says which kind was expected, where it cannot be read or is too large."""
+    require_content(path)
     try:
-        require_content(path)
-        with _File(path) as content, Image.open(content, formats=FORMATS) as file:
-            if file.width * file.height > MOST_PIXELS or max(file.size) > MOST_ROWS:
-                raise InputError(
-                    f"expected {kind} of at most {MOST_PIXELS:,} pixels and {MOST_ROWS:,} a side, got {file.width} x "
-                    f"{file.height} px in {path}; reduce it"
-                )
-            yield file
+        with ImageFile(path) as content:
+            try:
+                file = open_image(content, FORMATS)
+            except InputError as error:
+                raise InputError(f"expected {kind}, got one of {error} in {path}; reduce it") from None
+            with file:
+                yield file
     except InputError:
         raise
     except UNREADABLE as error:

@@ -79,7 +79,7 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
         (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     _conclude(table, options, out)
-    say(*notes, style="yellow", console=Console(stderr=True))
+    say(*notes, *checkpoint.assumptions, style="yellow", console=Console(stderr=True))
     return 0
 
 

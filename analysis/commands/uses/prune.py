@@ -95,7 +95,7 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
         result = _scored(training.gaussians, objective, held_out)
     shutil.rmtree(unfinished, ignore_errors=True)
     _conclude(ranks, curve, training.gaussians, result, out)
-    say(*notes, style="yellow", console=console)
+    say(*notes, *checkpoint.assumptions, style="yellow", console=console)
     return 0
 
 

@@ -82,7 +82,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         notes = draw_or_say("uses", folder)
     means = table.drop(columns="view").pivot_table(index="precision")  # by default means
     words = f"means over {len(held_out)} held-out views; agreement.csv, view-*.png in {out}"
-    say(means.round(3).to_string(), words, *notes)
+    say(means.round(3).to_string(), words, *notes, *checkpoint.assumptions)
     return 0
 
 

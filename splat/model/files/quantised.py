@@ -22,14 +22,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 
 from landscape.errors import InputError, lacks_memory
 from splat.model.files.ply import Header, read_header, read_rows
 from splat.model.files.splat_file import SplatFile, clamped_note, logit, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00, harmonics
-from splat.model.untrusted import loose_json
+from splat.model.untrusted import loose_json, open_image
 
 SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 CHUNK = 256  # Gaussians of a compressed PLY's chunk
@@ -171,7 +170,7 @@ def _check_sog(meta: Any, textures: dict[str, bytes]) -> None:
     count = meta["count"]
     sizes = {}
     for name, texture in textures.items():
-        with warnings.catch_warnings(action="error"), Image.open(io.BytesIO(texture), formats=["WEBP"]) as image:
+        with warnings.catch_warnings(action="error"), open_image(io.BytesIO(texture), ["WEBP"]) as image:
             sizes[name] = image.size[0] * image.size[1]
     files = [name for key in MEMBERS for name in meta[key]["files"]]
     tables = [meta["scales"]["codebook"], meta["sh0"]["codebook"]]
@@ -195,7 +194,7 @@ def _check_sog(meta: Any, textures: dict[str, bytes]) -> None:
 
 
 def _check_labels(texture: bytes, count: int, palette: int) -> None:
-    with Image.open(io.BytesIO(texture), formats=["WEBP"]) as image:
+    with open_image(io.BytesIO(texture), ["WEBP"]) as image:
         pixels = np.array(image.convert("RGBA")).reshape(-1, 4)[:count].astype(np.int64)
     if (pixels[:, 0] + 256 * pixels[:, 1]).max() >= palette:
         raise InputError("its labels point beyond its palette of harmonics")

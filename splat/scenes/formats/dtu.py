@@ -17,6 +17,7 @@ import scipy
 import torch
 
 from landscape.errors import InputError
+from splat.model.untrusted import read_text
 from splat.scenes.images import Photo, image_header
 
 LIGHT = 3
@@ -51,7 +52,7 @@ def read_dtu(root: Path) -> list[Photo]:
                 "Calibration beside Rectified, or use a COLMAP model of the scan"
             )
         try:
-            matrix = np.loadtxt(position, dtype=np.float64).reshape(3, 4)
+            matrix = np.loadtxt(read_text(position).splitlines(), dtype=np.float64).reshape(3, 4)
         except ValueError as error:
             raise InputError(f"expected a 3 x 4 matrix in {position}, cannot read it: {error}") from error
         if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix[:, :3]) < 3:

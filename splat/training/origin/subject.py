@@ -32,7 +32,8 @@ class Checkpoint(ShortRepr):
     """A saved training and its scene.
 
     origin: what was assumed of another tool's file (`foreign_training`).  all_views: number of views that it was trained on,
-    where the scene names fewer (`thinned`).  changed: what is not as it was in the training, where that was accepted.
+    where the scene names fewer (`thinned`).  changed: what is not as it was in the training, where that was accepted.  notes:
+    of the scene, once it is opened.
     """
 
     training: Training
@@ -40,15 +41,16 @@ class Checkpoint(ShortRepr):
     origin: dict[str, Any] | None = None
     all_views: int | None = None
     changed: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def assumptions(self) -> list[str]:
-        """Sentences on what was assumed of another tool's file, and on what was accepted."""
+        """Sentences on what was assumed of the scene and of another tool's file, and on what was accepted."""
         changed = [f"not as in the training, and accepted: {each}" for each in self.changed]
         if self.origin is None:
-            return changed
+            return [*self.notes, *changed]
         summary = "trained by {trained_by} ({trained_by_source}), training views: {views}; {psnr:.1f} dB on two of them"
-        return [summary.format(**self.origin), *self.origin["notes"], *changed]
+        return [*self.notes, summary.format(**self.origin), *self.origin["notes"], *changed]
 
     @property
     def state(self) -> str:
@@ -100,8 +102,10 @@ class Checkpoint(ShortRepr):
         changed = tuple(changes(reference.views, now))
         if not accept:
             reference.require_unchanged(now, scene.root, "restore them, train anew, or go on with --accept-changed")
-        checkpoint = replace(self, scene=replace(reference, views=now), changed=changed)
-        return Subject(path, checkpoint, posed(scene, reference.similarity, centred=reference.centred))
+        scene = posed(scene, reference.similarity, centred=reference.centred)
+        return Subject(
+            path, replace(self, scene=replace(reference, views=now), changed=changed, notes=scene.notes), scene
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from PIL import Image
@@ -22,10 +23,12 @@ from splat.model.untrusted import (
     read_arrays,
     read_json,
     read_picture,
+    read_table,
     read_toml,
     replacing,
     require_name,
     short,
+    unpacked,
     write_atomically,
 )
 from tests.refusals import refused
@@ -90,7 +93,8 @@ def test_names_that_are_not_fit_for_a_file_or_folder_are_refused(name):
         (read_json, b"[" * 5000), (read_json, b"{"), (read_json, b'"\xff"'), (read_toml, b"a = " + b"[" * 5000),
         (read_toml, b"a = " + b"9" * 6000), (read_toml, b"\xff"), (read_picture, b"GIF89a"), (read_picture, b""),
         (read_json, b"[" * 65 + b"]" * 65), (read_toml, b"a = " + b"[" * 64 + b"]" * 64),
-        (read_arrays, b"PK"), (read_arrays, b"not an archive"),
+        (read_arrays, b"PK"), (read_arrays, b"not an archive"), (read_table, b""), (read_table, b"a\n\xff"),
+        (read_table, b"a,b\n1,2\n1,2,3"),
     ],
 )  # fmt: skip
 def test_what_is_none_is_refused_in_a_sentence_that_names_the_file(tmp_path, read, content):
@@ -106,9 +110,16 @@ def test_json_of_other_tools_is_read_as_python_does_or_refused(content):
     refused("no JSON", loose_json, content)
 
 
+def test_packed_structures_of_another_kind_or_too_deep_are_refused():
+    assert unpacked(msgspec.msgpack.encode([1, 2]), list[int]) == [1, 2]
+    for content in (b"", b"\xc1", msgspec.msgpack.encode({"a": 1}), b"\x91" * 10**5):
+        refused("expected list, got", unpacked, content, list[int])
+
+
 def test_pictures_and_texts_have_a_greatest_size(tmp_path, monkeypatch):
-    Image.new("L", (2**14, 2**12 + 1)).save(tmp_path / "large.png")
-    refused("of at most 67,108,864", read_picture, tmp_path / "large.png")
+    for size in ((2**14, 2**12 + 1), (1, 2**16 + 1)):
+        Image.new("L", size).save(tmp_path / "large.png")
+        refused("at most 67,108,864 and 65,536 a side", read_picture, tmp_path / "large.png")
     monkeypatch.setattr(untrusted, "MOST_TEXT", 3)
     (tmp_path / "text").write_text("[12]")
     refused("4 bytes, of at most 3", read_json, tmp_path / "text")
@@ -144,19 +155,27 @@ def test_a_name_as_long_as_the_system_allows_can_be_written(tmp_path):
     assert len(short("x" * 201)) < 40 and short("x" * 201) != short("x" * 202) and short("x" * 200) == "x" * 200
 
 
-BARE = {"np.load", "json.load", "json.loads", "msgspec.json.decode", "tomllib.load", "tomllib.loads", "pickle.load"}
+READERS = {"json.loads", "msgspec.json.decode", "msgspec.msgpack.decode", "tomllib.loads", "pd.read_csv", "Image.open"}
+BARE = {*READERS, "np.load", "np.loadtxt", "np.genfromtxt", "json.load", "tomllib.load", "pickle.load", "torch.load"}
+NAMES = {"open", "read_text", "write_text", *(name.rpartition(".")[2] for name in BARE)}
 
 
 def test_files_are_read_by_one_module_and_text_is_utf_8():
     """Whatever the locale is; bare readers know no bounds."""
     found = set()
-    for layer in ("landscape", "splat", "analysis", "figures"):
+    for layer in ("landscape", "splat", "analysis", "figures", "notebooks"):
         for path in (ROOT / layer).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Call) and _is_bare(node):
+                if isinstance(node, ast.Call) and _called(node) in NAMES and _is_bare(node):
                     found.add((path.relative_to(ROOT).as_posix(), ast.unparse(node.func)))
-    readers = ("json.loads", "msgspec.json.decode", "tomllib.loads")
-    assert found == {("splat/model/untrusted.py", name) for name in readers}
+    of_torch = {("splat/model/files/tensor_files.py", "torch.load"), ("splat/training/checkpoint.py", "torch.load")}
+    of_text = {("splat/scenes/formats/dtu.py", "np.loadtxt")}
+    assert found == {("splat/model/untrusted.py", name) for name in READERS} | of_torch | of_text
+
+
+def _called(call: ast.Call) -> str:
+    """The last name of what is called."""
+    return getattr(call.func, "attr", getattr(call.func, "id", ""))
 
 
 def _is_bare(call: ast.Call) -> bool:

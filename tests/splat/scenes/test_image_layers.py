@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from landscape.errors import InputError
-from splat.scenes.layers import MOST_ROWS, STRIP, dtu_number, find_layer, read_depth, read_mask
+from splat.scenes.layers import STRIP, dtu_number, find_layer, read_depth, read_mask
 from splat.scenes.scene import load_scene
 from splat.scenes.view import View
 from tests.refusals import refused

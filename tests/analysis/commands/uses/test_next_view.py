@@ -28,8 +28,8 @@ def run(folder: Path, *words: str) -> int:
     return main(["next-view", str(folder / "in.ply"), "--scene", str(folder / "scene"), "--views", "3", *words])
 
 
-def test_candidates_are_judged_and_picked_one_after_the_other(folder):
-    assert run(folder, "--take", "2") == 0
+def test_candidates_are_judged_and_picked_one_after_the_other(folder, capsys):
+    assert run(folder, "--take", "2") == 0 and "trained by splat-landscape" in capsys.readouterr().err
     table = pd.read_csv(folder / "next-view" / "gains.csv", index_col="view")
     names = [frame.name for frame in MADE.scene.frames]
     assert {*table.index} == {names[i] for i in (2, 3, 5, 6)}

@@ -73,7 +73,7 @@ def test_scores_are_compared_with_true_removals(curved):
     assert ranks.loc["error", "removal_error"] == pytest.approx(true)
 
 
-def test_refinement_lowers_the_training_loss(folder, tmp_path):
+def test_refinement_lowers_the_training_loss_and_what_was_assumed_is_said(folder, tmp_path, capsys):
     psnr = {}
     for steps in (0, 20):
         out = tmp_path / str(steps)
@@ -82,6 +82,7 @@ def test_refinement_lowers_the_training_loss(folder, tmp_path):
         views = loaded.with_scene(out / "checkpoint.pt").scene.load(loaded.scene.train)
         psnr[steps] = evaluate(loaded.training.gaussians, views).psnr
     assert psnr[20] > psnr[0] + 0.1
+    assert "trained by splat-landscape" in capsys.readouterr().err
 
 
 def test_a_curve_that_is_stopped_goes_on(folder, curved, tmp_path, monkeypatch):

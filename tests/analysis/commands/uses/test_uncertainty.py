@@ -31,8 +31,8 @@ def run(folder: Path, *words: str) -> int:
     return main(["uncertainty", str(folder / "in.ply"), "--scene", str(folder / "scene"), "--guess-views", *words])
 
 
-def test_the_table_follows_from_the_maps(folder):
-    assert run(folder, "--samples", "8", "--views", "3") == 0
+def test_the_table_follows_from_the_maps(folder, capsys):
+    assert run(folder, "--samples", "8", "--views", "3") == 0 and "trained by splat" in capsys.readouterr().out
     out, table = folder / "uncertainty", pd.read_csv(folder / "uncertainty" / "agreement.csv")
     assert len(table) == 2 and {*table.precision} == {"block", "diagonal"}
     maps = np.load(out / "view-000.npz")
