@@ -47,7 +47,7 @@ def run_view(options: ViewOptions) -> int:
         notes: list[str] = []
         with stages, stages.stage("fields") as progress:
             viewer.add_fields(measured_fields(objective, folder / PROBE, made, notes, progress), options.shown)
-        say(*notes, *checkpoint.assumptions, style="yellow", console=console)
+        say(*notes, *subject.checkpoint.assumptions, style="yellow", console=console)
         if options.html is None:
             viewer.add_steps(directions)
             Event().wait()
