@@ -14,7 +14,7 @@ import re
 import shutil
 import tomllib
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
@@ -217,7 +217,7 @@ class ImageFile(BufferedReader):
         return repr(self.name)
 
 
-def open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
+def open_image(file: BinaryIO, formats: tuple[str, ...]) -> Image.Image:
     """A picture, of which the size alone has been read.  InputError where it has more than MOST_PIXELS or MOST_ROWS.
 
     formats: Pillow recognises a file by its content, whatever its name, and would start Ghostscript for PostScript.

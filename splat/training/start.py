@@ -7,8 +7,9 @@ points      points: the scene's, from structure from motion, those seen by at le
             random: a random pixel of a random training view at a depth uniform between near and far, kept where at
                 least two views see it and no view is transparent there (alpha 0), in that pixel's colour.  near, far:
                 the scene files' depth range, else half and one and a half times the camera's distance to the place that
-                all cameras look at.  Gaussians of the background's colour in front of it would have no gradient: they
-                stay, and hide the object from other viewpoints
+                all cameras look at, else (parallel cameras) all but a thousandth of the points that two views see on either
+                side.  Gaussians of the background's colour in front of it would have no gradient: they stay, and hide the
+                object from other viewpoints
             box: DNGaussian's start (its scene/dataset_readers.py): random places in the box of the scene's points, of the sides
                 1.3 (max - min), BOX_DENSITY of them per world unit of the longest side, grey.  The box begins at the
                 BOX_RANK-th smallest coordinate, so that it is not centred on the points
@@ -20,7 +21,7 @@ log_scales  isotropic: log of the root mean square distance to the three nearest
 opacity     0.1                                 sh      band 0 gives the point's colour, the others 0
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import log, sqrt
 from typing import Literal
 
@@ -32,7 +33,6 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.linalg import group_sums
-from splat.model.camera import Camera
 from splat.model.capture import common_target
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
@@ -45,6 +45,7 @@ OPACITY = 0.1
 NEIGHBOURS = 3
 SMALLEST_SCALE = sqrt(1e-7)  # of the median scale: for points that all but coincide with three others
 NEAR, FAR = 0.5, 1.5  # of the distance to the cameras' common target; Blender's 4 gives its usual 2 and 6
+OUTLIERS = 0.001  # of the points that a view shows, on either side
 MAX_DRAWS = 200  # per random point wanted
 SEEN_BY = 2  # views at least, or all if they are fewer
 BOX_RANK, BOX_SHARE, BOX_DENSITY = 20, 1.3, 50
@@ -66,6 +67,7 @@ def initial_gaussians(
     >>> initial_gaussians(scene, scene.load(), sh_degree=1, generator=torch.Generator().manual_seed(0)).sh_degree
     1
     """
+    frames = scene.select([view.name for view in views])
     if source in ("points", "box") and scene.points is None:
         raise InputError(
             f"expected a scene with points, {scene.root} has none; start from dense, triangulated or random ones"
@@ -74,10 +76,10 @@ def initial_gaussians(
         assert scene.points is not None
         return gaussians_from_points(points_in_box(scene.points, generator), views, sh_degree, seen_by=0)
     if source == "triangulated":
-        return gaussians_from_points(triangulated_points(scene.select([view.name for view in views])), views, sh_degree)
+        return gaussians_from_points(triangulated_points(frames), views, sh_degree)
     if source in ("scene", "points") and scene.points is not None:
         return gaussians_from_points(scene.points, views, sh_degree)
-    ranges = depth_ranges(views, [frame.depth_range for frame in scene.select([view.name for view in views])])
+    ranges = depth_ranges(views, [frame.depth_range for frame in frames], lambda: _known_points(scene, frames))
     if source == "dense":
         from splat.scenes.sfm.plane_sweep import dense_points  # a fifth of a second of imports
 
@@ -144,9 +146,43 @@ def points_in_box(points: Points, generator: torch.Generator) -> Points:
     return Points(corner + BOX_SHARE * sides * places, torch.full((n, 3), 0.5))
 
 
-def depth_ranges(views: Sequence[View], given: Sequence[tuple[float, float] | None]) -> list[tuple[float, float]]:
-    """The least and greatest z in each view, world units: as given, else by where the cameras look."""
-    return [own or _range_around_target(views, view.camera) for view, own in zip(views, given, strict=True)]
+def depth_ranges(
+    views: Sequence[View], given: Sequence[tuple[float, float] | None], known: Callable[[], Points]
+) -> list[tuple[float, float]]:
+    """The least and greatest z in each view, world units: as given, else by where the cameras look.
+
+    known: points of the scene, for cameras that look at no common place; their z as LLFF takes the bounds of a view.
+    """
+    if all(given):
+        return [own for own in given if own]
+    target = common_target([view.camera for view in views])
+    if target is not None:
+        depths = [float((target - view.camera.centre) @ view.camera.forward) for view in views]
+        return [own or (NEAR * depth, FAR * depth) for own, depth in zip(given, depths, strict=True)]
+    points = known()
+    xyz = points.xyz[points.sightings(views) >= min(SEEN_BY, len(views))]
+    return [own or _range_of_points(view, xyz) for own, view in zip(given, views, strict=True)]
+
+
+def _range_of_points(view: View, xyz: Float[Tensor, "n 3"]) -> tuple[float, float]:
+    z = pixel_coordinates(view.camera, xyz[inside_image(view.camera, xyz)])[1]
+    if len(z) <= NEIGHBOURS:
+        raise InputError(
+            f"expected points in {view.name} that another training view sees too, which say how far away the scene is where "
+            f"cameras look at no common place, got {len(z)}; choose views that overlap more, or --start points"
+        )
+    near, far = np.quantile(z.numpy(), [OUTLIERS, 1 - OUTLIERS]).tolist()
+    return near, far
+
+
+def _known_points(scene: Scene, frames: Sequence[Frame]) -> Points:
+    """The scene's points, else those of the training views alone."""
+    if scene.points is None and len(frames) == 1:
+        raise InputError(
+            "expected at least 2 training views, got 1: one alone does not say how far away the scene is; "
+            "take more views, or start from points (COLMAP), or give depth ranges (poses_bounds.npy)"
+        )
+    return triangulated_points(frames) if scene.points is None else scene.points
 
 
 def points_in_common_volume(
@@ -196,20 +232,3 @@ def _random_batch(
         u, v = pixel.long().unbind(-1)
         rgb[mine] = view.image[:, v, u].T
     return xyz, rgb
-
-
-def _range_around_target(views: Sequence[View], camera: Camera) -> tuple[float, float]:
-    """Depths round the point that is nearest to all optical axes."""
-    if len(views) == 1:
-        raise InputError(
-            "expected at least 2 training views, got 1: one alone does not say how far away the scene is; "
-            "take more views, or start from points (COLMAP), or give depth ranges (poses_bounds.npy)"
-        )
-    target = common_target([view.camera for view in views])
-    if target is not None:
-        depth = float((target - camera.centre) @ camera.forward)
-        return NEAR * depth, FAR * depth
-    raise InputError(
-        f"expected {len(views)} cameras that look at a common place, got parallel or diverging ones: the scene's depth "
-        "is unknown; give the scene points (COLMAP), or depth ranges (poses_bounds.npy)"
-    )

@@ -109,7 +109,8 @@ def model(
 
     def use(root: Path, chance: Random) -> Read:
         listed = root / "list.txt" if "list.txt" in (beside or {}) else None
-        subject = open_subject(root / file, Foreign(trained_by=trained_by, scene=root / "scene", train_list=listed))
+        ask = Foreign(trained_by=trained_by, scene=root / "scene", train_list=listed, guess_views=True)
+        subject = open_subject(root / file, ask)
         flat, names = subject.checkpoint.training.gaussians.flat, subject.checkpoint.scene.train
         assert torch.isfinite(flat).all() and set(names) <= {*subject.scene.names}, "a scene that cannot be"
         return [flat]

@@ -170,7 +170,7 @@ def _check_sog(meta: Any, textures: dict[str, bytes]) -> None:
     count = meta["count"]
     sizes = {}
     for name, texture in textures.items():
-        with warnings.catch_warnings(action="error"), open_image(io.BytesIO(texture), ["WEBP"]) as image:
+        with warnings.catch_warnings(action="error"), open_image(io.BytesIO(texture), ("WEBP",)) as image:
             sizes[name] = image.size[0] * image.size[1]
     files = [name for key in MEMBERS for name in meta[key]["files"]]
     tables = [meta["scales"]["codebook"], meta["sh0"]["codebook"]]
@@ -194,7 +194,7 @@ def _check_sog(meta: Any, textures: dict[str, bytes]) -> None:
 
 
 def _check_labels(texture: bytes, count: int, palette: int) -> None:
-    with open_image(io.BytesIO(texture), ["WEBP"]) as image:
+    with open_image(io.BytesIO(texture), ("WEBP",)) as image:
         pixels = np.array(image.convert("RGBA")).reshape(-1, 4)[:count].astype(np.int64)
     if (pixels[:, 0] + 256 * pixels[:, 1]).max() >= palette:
         raise InputError("its labels point beyond its palette of harmonics")

@@ -149,7 +149,7 @@ def test_too_few_points_are_refused_with_their_number() -> None:
 
 
 def ranges_of(seen: list[View]) -> list[tuple[float, float]]:
-    return depth_ranges(seen, [None] * len(seen))
+    return depth_ranges(seen, [None] * len(seen), some_points)
 
 
 def test_random_points_lie_where_two_views_see_them_in_a_pixels_colour() -> None:
@@ -218,16 +218,27 @@ def test_a_box_of_random_points_begins_at_the_twentieth_coordinate(monkeypatch: 
     refused("expected at least 20 points for a box", points_in_box, some_points(19), generator)
 
 
-def test_parallel_cameras_need_a_depth_range() -> None:
-    refused("parallel or diverging", ranges_of, views(parallel=True))
-    ranges = [(3.0, 5.0)] * 3
-    assert len(points_in_common_volume(views(parallel=True), 10, torch.Generator(), ranges)) == 10
+def test_parallel_cameras_take_their_depth_from_points_that_two_of_them_see() -> None:
+    given, points = [(3.0, 5.0), None, None], some_points(4000)
+    first, *ranges = depth_ranges(views(parallel=True), given, lambda: points)
+    assert first == (3.0, 5.0)
+    common = points.xyz[points.sightings(views()) >= 2]
+    for (near, far), view in zip(ranges, views(parallel=True)[1:], strict=True):
+        z = (common - view.camera.centre)[:, 2]
+        shown = z[inside_image(view.camera, common)].sort().values
+        assert shown[0] < near < shown[2] and shown[-3] < far < shown[-1]
+    assert len(points_in_common_volume(views(parallel=True), 10, torch.Generator(), [first, *ranges])) == 10
+    behind = replace(points, xyz=points.xyz - 90)
+    refused(
+        r"another training view sees too, .*, got 0;", depth_ranges, views(parallel=True), [None] * 3, lambda: behind
+    )
 
 
 def test_one_view_alone_needs_a_depth_range_and_says_so() -> None:
-    with pytest.raises(ValueError, match=r"at least 2 training views, got 1: .*; take more views, or") as caught:
-        ranges_of(views((0,)))
-    assert "parallel" not in str(caught.value)
+    frame = Frame("a", camera(), lambda camera: views((0,))[0])
+    scene = Scene("s", Path("s"), "synthetic", (frame,), None, torch.zeros(3))
+    said = r"at least 2 training views, got 1: .*; take more views, or"
+    refused(said, initial_gaussians, scene, views((0,)), generator=torch.Generator(), source="random")
     assert len(points_in_common_volume(views((0,)), 10, torch.Generator(), [(3.0, 5.0)])) == 10
 
 
