@@ -115,7 +115,8 @@ def _refusing(what: str, path: Path) -> Iterator[None]:
     except Exception as error:
         if is_of_the_system(error):
             raise
-        raise InputError(f"expected {what} in {path}, got a damaged file ({error})") from None
+        said = " ".join(str(error).split())  # of pandas with a line's end
+        raise InputError(f"expected {what} in {path}, got a damaged file ({said})") from None
 
 
 def is_of_the_system(error: BaseException) -> bool:
