@@ -238,11 +238,9 @@ def _conclude(
     Console().print(table)
     for (removed, steps), loss in zip(columns, losses, strict=True):
         best = min(EXACT, key=lambda name, of=loss: of[name])
-        verb = "less than" if loss[best] < loss["opacity"] else "NOT less than"
-        say(
-            f"{removed:.0%} removed, {steps} steps after: {best} loses {loss[best]:.2f} dB, {verb} opacity's "
-            f"{loss['opacity']:.2f} dB"
-        )
+        found = f"{best} loses {loss[best]:.2f} dB, opacity {loss['opacity']:.2f} dB"
+        limit = f"; undecided, because those {steps} steps have one seed" if steps else ", of this one training"
+        say(f"{removed:.0%} removed, {steps} steps after: {found}{limit}")
     scored = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in result.items() if np.isfinite(value))
     say(f"kept {len(gaussians):,} Gaussians: {scored}")
     say(f"checkpoint.pt, pruned.ply, scores.csv, correlations.csv{', curve.png' if columns else ''} in {out}")

@@ -81,8 +81,12 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     means = table.drop(columns="view").pivot_table(index="precision")  # by default means
-    words = f"means over {len(held_out)} held-out views; agreement.csv, view-*.png in {out}"
-    say(means.round(3).to_string(), words, *notes, *checkpoint.assumptions)
+    words = (
+        "ause: area under the sparsification error, 0 at best; ause_random: of an order that knows nothing",
+        "a variance leaves out what couples the Gaussians (diagonal: also their parameters), and has no unit of the error",
+        f"means over {len(held_out)} held-out views; agreement.csv, view-*.png in {out}",
+    )
+    say(means.round(3).to_string(), *words, *notes, *checkpoint.assumptions)
     return 0
 
 
