@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -170,6 +171,9 @@ def test_without_a_home_or_a_folder_beside_the_code_kernels_are_kept_with_tempor
         monkeypatch.delenv("HOME", raising=False) if home is None else monkeypatch.setenv("HOME", home)
         monkeypatch.setattr(kernel_cache, "gettempdir", lambda: str(tmp_path))
         assert kernel_cache._places()[-1] == tmp_path / f"splat-landscape-{os.getuid()}"
+    # no folder for temporary files can be written, as under `ulimit -f 0`
+    monkeypatch.setattr(kernel_cache, "gettempdir", partial(open, "/none/of/them"))
+    assert kernel_cache._places() == [kernel_cache.PACKAGE / "__pycache__"]
     file = tmp_path / "file"
     file.write_text("")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(file))

@@ -124,6 +124,7 @@ def test_a_record_may_have_no_slice_and_no_arrays(tmp_path):
         (lambda d: d.update(arrays={"spectrum": 3}), '`object`, got 3 as "arrays.spectrum"'),
         (lambda d: d["arrays"]["spectrum"].pop("residuals"), r"residuals of shape \[\] instead of \[k\]"),
         (lambda d: d["arrays"]["slice"].pop("y"), "loss of shape"),
+        (lambda d: d["slice"].update(resolved=False), "`evaluated_points` of a plane that is not resolved, got none"),
     ],
 )
 def test_a_changed_record_is_refused_by_file_and_key(tmp_path, change, words):
@@ -160,6 +161,14 @@ def test_a_changed_array_is_refused_by_file_and_name(tmp_path, array, words):
     known: dict[str, Any] = {name: values for name, values in arrays.items() if values is not None}
     np.savez(folder / "slice.npz", **known)
     with pytest.raises(ValueError, match=rf"slice\.npz, got {words}.*; probe again"):
+        read_record(folder)
+
+
+def test_residuals_below_0_are_refused(tmp_path):
+    folder, arrays = written(tmp_path / "probe"), synthetic()[1]["spectrum"]
+    known: dict[str, Any] = arrays | {"residuals": -1.0 - arrays["residuals"]}
+    np.savez(folder / "spectrum.npz", **known)
+    with pytest.raises(InputError, match=r"spectrum\.npz, got residuals below 0"):
         read_record(folder)
 
 

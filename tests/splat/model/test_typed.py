@@ -97,6 +97,7 @@ def test_settings_outside_of_their_ranges_are_refused_by_name(kind, names, value
         (list[Count], [1, -1], r"^'c\[1\]': expected int >= 0, got -1$"),
         (dict[str, Count], {"a": torch.zeros(2)}, r"^'c\[...\]': expected int, got Tensor$"),
         (DensifySettings, {"min_opacity": 0.5}, "^'c': expected min_opacity < reset_opacity"),
+        (TrainConfig, {"loss": {"pixel": "\ud800"}}, r"^'c': expected text, got '\\ud800'$"),
     ],
 )
 def test_values_of_a_file_are_refused_with_key_expected_and_got(kind, content, words):
