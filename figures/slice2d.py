@@ -3,7 +3,7 @@
 Sections: the loss, from true renders; dots where the plane is not rendered whole, blue where the order of the splats or the set
 of visible ones is not the centre's; dashed: the quadratic model.  Their titles compare the mean of both ends with the model
 there.  They share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes count steps in
-curvature units, within one of which the curvature alone changes the loss by the amount named.
+curvature units: steps within which the curvature alone changes the loss by the amount named.
 
 Plane: three contours of the loss and, dashed, of the model at the same levels; grey dots: renders; grey: no finite loss;
 crosses: the checkpoint (upright), and where the plane leads.  Where too few points are renders to know the others, the sections

@@ -10,7 +10,7 @@ from landscape.slices.finite_probe import NOISE_POINTS, STEPS
 
 FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density's run and along a side of a slice
 FEWEST_PRODUCTS = 16  # of a density
-TEN = 10  # eigenpairs from either end, of which the spread over Gaussians is told
+TEN = 10  # eigenpairs from either end whose spread over Gaussians is told
 
 
 @dataclass(frozen=True)

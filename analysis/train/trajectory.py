@@ -144,7 +144,7 @@ class Trajectory:
 
     @property
     def skipped(self) -> str:
-        """Sentence on records of which nothing could be measured, with the last reason; empty without any."""
+        """Sentence on the records that hold no measurement, with the last reason; empty without any."""
         notes = [row["note"] for row in self.rows if row["state"] == "skipped"]
         return f"of {len(self.rows)} records of the landscape {len(notes)} are empty: {notes[-1]}" if notes else ""
 

@@ -4,8 +4,8 @@
     top(k)      the share of sum |lambda_i| that the k largest hold
 
 Every start vector of a density gives a rule: magnitudes with a number of eigenvalues each, which is a fraction, beside those
-known one by one.  Sums between two magnitudes are interpolated.  The bracket is Student's, of what the start vectors say; what
-the rules themselves are off by is small beside that (`tests/landscape/spectrum/test_concentration.py`).
+known one by one.  Sums between two magnitudes are interpolated.  The bracket is Student's, over the start vectors; the
+error of the rules themselves is small beside it (`tests/landscape/spectrum/test_concentration.py`).
 """
 
 import numpy as np
