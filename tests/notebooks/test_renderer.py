@@ -15,7 +15,7 @@ def made(tmp_path_factory):
     """The table of a smaller scene, whose products are of an earlier call."""
     out = tmp_path_factory.mktemp("renderer") / "renderer.csv"
     patch = pytest.MonkeyPatch()
-    patch.setattr(command, "demo", lambda: demo(gaussians=30, width=24, height=18, steps=10))
+    patch.setattr(command, "demo", lambda: demo(gaussians=50, width=24, height=18, steps=10))
     assert command.main([*SMALLEST, "--out", str(out), "--part", "products"]) == 0
     first = pd.read_csv(out)
     assert command.main([*SMALLEST, "--out", str(out)]) == 0
