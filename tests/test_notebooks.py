@@ -57,6 +57,16 @@ def test_the_curvature_of_the_nerf_is_that_of_its_dense_hessian():
     assert -10 * float(names["loss"].detach().log10()) > 20  # it has learnt its pixels
 
 
+def test_the_nerf_through_one_derivative_is_within_the_stated_errors():
+    _, names = story("nerf")
+    assert names["held"] >= 90
+    largest = names["seen_ends"].largest
+    assert abs(float(largest.values[0]) - float(names["exact"][-1])) <= float(largest.residuals[0])
+    for name, rows in names["bridge"].blocks.items():
+        found = names["seen_traces"][name]
+        assert found.low <= float(names["J"][rows].sum()) <= found.high
+
+
 def test_the_comparison_says_what_the_stored_table_says():
     printed, names = story("stablegs_vs_3dgs")
     rows, lines = names["rows"], printed.splitlines()
