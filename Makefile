@@ -1,6 +1,7 @@
 # make demo   install, train and probe a small synthetic scene
 # make test   install, also the developers' tools, then ruff, pyright and pytest
 # make test-everywhere   the tests as other processors run them, which takes hours
+# make docs   the documentation as pages, in build/docs
 # make setup  the shared first half: an environment in .venv with everything that the commands need
 # make clean  remove the environment and builds; what you trained and measured, in runs/, stays
 PYTHON ?= python3
@@ -10,7 +11,7 @@ STAMP := $(VENV)/.installed
 TOOLS := $(VENV)/.tools-installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: setup demo test test-everywhere clean
+.PHONY: setup demo test test-everywhere docs clean
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
@@ -36,6 +37,10 @@ test: $(TOOLS)
 
 test-everywhere: $(TOOLS)
 	$(BIN)/python -m tests.everywhere
+
+docs: setup
+	$(PIP) --editable '.[docs]'
+	$(BIN)/mkdocs build --strict --site-dir build/docs
 
 clean:
 	rm -rf $(VENV) build *.egg-info
