@@ -79,7 +79,7 @@ def draw_gains(table: pd.DataFrame) -> Figure:
         axes = figure.subplots()
         axes.errorbar(-table["behind"], rows, xerr=2 * table["error"], fmt="o", color=BLUE, markersize=3, linewidth=0.8)
         labels = []
-        for place, (view, pick) in enumerate(zip(table["view"], table["pick"], strict=True)):
+        for place, (view, pick) in enumerate(zip(table["view"].tolist(), table["pick"].tolist(), strict=True)):
             named = [rule for rule, at in best.items() if at == place]
             words = ", ".join([*([f"pick {pick:.0f}"] if float(pick) > 0 else []), *named])
             labels.append(literal(Path(str(view)).name + (f"  ({words})" if words else "")))

@@ -9,9 +9,7 @@ import pytest
 from landscape.errors import InputError
 
 
-def refused(
-    words: str, call: Callable[..., object], *given: Any, error: type[Exception] = InputError, **more: Any
-) -> str:
+def refused(words: str, call: Callable[..., object], *given: Any, error: Any = InputError, **more: Any) -> str:
     """The sentence with which a call is refused, in which a pattern is found.  given, more: the call's arguments."""
     with pytest.raises(error, match=words) as caught:
         call(*given, **more)

@@ -111,6 +111,8 @@ def _carrier(end: Eigenvalue) -> str:
         )
     if carrier.found == 1:
         return text
+    if carrier.found < 2:
+        return text
     return f"{text}; none of the first {carrier.found} eigenvectors from this end lies on more than ten Gaussians"
 
 

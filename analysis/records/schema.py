@@ -26,7 +26,6 @@ Operator = Literal["hessian", "gauss-newton"]
 IndexName = Literal["eigenvalue_ratio", "negative_ratio", "top_mass", "participation_ratio"]
 ROUND_OFF = 1e-6  # by which numbers may leave their order or [0, 1]
 NonNegative = Annotated[float, Meta(ge=0)]
-Size = NonNegative | None
 Portion = Annotated[float, Meta(ge=-ROUND_OFF, le=1 + ROUND_OFF)]
 
 
@@ -58,9 +57,13 @@ class Objective(Struct, kw_only=True):
     sizes: list[tuple[int, int]] | None = None
     background: tuple[float, float, float] | None = None
     operator: Operator | None = None
-    value: Size = None
-    gradient_norm: Size = None
+    value: Number = None
+    gradient_norm: Number = None
     views_error: Maybe[Number] = UNSET
+
+    def __post_init__(self) -> None:
+        require_order(zero=0.0, value=self.value)
+        require_order(zero=0.0, gradient_norm=self.gradient_norm)
 
 
 class TraceOf(Struct, kw_only=True):
@@ -75,7 +78,7 @@ class TraceOf(Struct, kw_only=True):
     """
 
     value: Number
-    standard_error: Size
+    standard_error: Number
     low: Number = None
     high: Number = None
     confidence: Number = None
@@ -89,6 +92,7 @@ class TraceOf(Struct, kw_only=True):
     views_error: Maybe[Number] = UNSET
 
     def __post_init__(self) -> None:
+        require_order(zero=0.0, standard_error=self.standard_error)
         require_order(low=self.low, value=self.value, high=self.high)
 
     @property
@@ -147,12 +151,15 @@ class End(Struct, kw_only=True):
     """
 
     value: Number
-    residual: Size
+    residual: Number
     vector_error: Number = None
     reason: str | None = None
     note: Maybe[str] = UNSET
     views_error: Maybe[Number] = UNSET
     without_one: Maybe[tuple[float, float]] = UNSET
+
+    def __post_init__(self) -> None:
+        require_order(zero=0.0, residual=self.residual)
 
     @property
     def is_reached(self) -> bool:

@@ -25,7 +25,7 @@ from analysis.console.plain import say
 from analysis.records.provenance import provenance
 from notebooks.renderer.measure import Row, Sizes, best_step, ends, products, traces
 from notebooks.renderer.scenes import Scene, demo, trained
-from splat.model.untrusted import write_atomically
+from splat.model.untrusted import read_table, write_atomically
 
 RESULTS = Path(__file__).parents[1] / "results" / "renderer.csv"
 COLUMNS = (
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=RESULTS, help="the table")
     options = parser.parse_args(arguments)
     sizes = Sizes(options.each, options.seeds, options.samples, options.cover)
-    rows: list[Row] = pd.read_csv(options.out).to_dict("records") if options.out.exists() else []
+    rows: list[Row] = read_table(options.out).to_dict("records") if options.out.exists() else []
     small = demo()
     for scene in [small, replace(small, dtype=torch.float32), *map(trained, options.runs)]:
         for part in options.part or PARTS:
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 options.out.parent.mkdir(parents=True, exist_ok=True)
                 table = pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(index=False, float_format="%.4g")
                 write_atomically(options.out, table.encode())
-    say(page(pd.read_csv(options.out)), console=Console(width=200))
+    say(page(read_table(options.out)), console=Console(width=200))
     return 0
 
 
@@ -83,29 +83,32 @@ def _of(rows: Sequence[Row], scene: Scene, part: str) -> list[Row]:
 def page(table: pd.DataFrame) -> str:
     """The tables of the page, in Markdown: products with the naive differences at their best step, ends, traces."""
     lines = []
-    for (scene, kind), rows in table.groupby(["scene", "type"], sort=False):
-        at = rows[rows["part"] == "products"]
+    for scene, kind in table[["scene", "type"]].drop_duplicates().itertuples(index=False, name=None):
+        rows = pd.DataFrame(table[(table["scene"] == scene) & (table["type"] == kind)])
+        at, ends, traces, covers = (
+            pd.DataFrame(rows[rows["part"] == part]) for part in ("products", "ends", "traces", "cover")
+        )
         lines += [f"{scene}, {kind}, {int(rows['gaussians'].iloc[0])} Gaussians:", ""]
         lines += [
             "| direction | naive, best step | split (stated) | Gauss-Newton (stated) |",
             "| --- | --- | --- | --- |",
         ]
         for name, each in at.groupby("direction", sort=False):
-            ways = {way: found.sort_values("error").iloc[0] for way, found in each.groupby("way")}
+            ways = {way: pd.DataFrame(found).sort_values("error").iloc[0] for way, found in each.groupby("way")}
             cells = [f"{ways['naive']['error']:.2g}"]
             cells += [f"{ways[way]['error']:.2g} ({ways[way]['stated']:.2g})" for way in ("split", "gauss_newton")]
             lines.append(f"| {name} | {' | '.join(cells)} |")
-        if (rows["part"] == "ends").any():
+        if len(ends):
             lines += ["", "| lambda max | found | exact | error, worst seed | within the stated error |"]
             lines += ["| --- | --- | --- | --- | --- |"]
-        for row in rows[rows["part"] == "ends"].to_dict("records"):
+        for row in ends.to_dict("records"):
             within = f"{int(row['within'])} of {int(row['of'])}" if row["of"] == row["of"] else "none is stated"
             lines.append(f"| {row['way']} | {row['value']:.4g} | {row['exact']:.4g} | {row['error']:.2g} | {within} |")
-        if (rows["part"] == "traces").any():
+        if len(traces):
             lines += ["", "| trace of Gauss-Newton | found | interval | exact | seeds whose interval holds it |"]
             lines += ["| --- | --- | --- | --- | --- |"]
-        cover = {row["direction"]: row for row in rows[rows["part"] == "cover"].to_dict("records")}
-        for row in rows[rows["part"] == "traces"].to_dict("records"):
+        cover = {row["direction"]: row for row in covers.to_dict("records")}
+        for row in traces.to_dict("records"):
             held = cover.get(row["direction"], row)
             lines.append(
                 f"| {row['direction']} | {row['value']:.4g} | {row['low']:.4g} to {row['high']:.4g} | {row['exact']:.4g} | "

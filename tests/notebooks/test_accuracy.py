@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -272,7 +273,11 @@ RIVAL = {"10": (10.0, 1e-1), "1000": (1000.0, 1e-3)}
     ],
 )
 def test_a_ratio_is_read_at_equal_error_and_beyond_a_rivals_settings_it_is_a_bound(default, ratio, bound, holds):
-    rivals = {"r": ("peer", RIVAL), "quick": ("peer", {"5": (5.0, 0.95)}), "failed": ("peer", {"1": (1.0, math.nan)})}
+    rivals: dict[str, Any] = {
+        "r": ("peer", RIVAL),
+        "quick": ("peer", {"5": (5.0, 0.95)}),
+        "failed": ("peer", {"1": (1.0, math.nan)}),
+    }
     (line,) = ratios(table_of(d=("default", {"": default}), **rivals), {"c": 1e-16}).to_dict("records")
     assert (line["bound"], line["holds"], line["asked"], line["rival"]) == (bound, holds, 1.1, "r")
     assert [line[name] for name in ("ratio", "seconds_ratio", "low", "high")] == pytest.approx([ratio] * 4)

@@ -148,7 +148,7 @@ def test_a_world_far_from_its_origin_is_planned_near_it_and_loaded_again_as_it_w
     assert scene.points is not None and scene.points.xyz.abs().max() < 100
     file, seen = own_file(Checkpoint(training, reference))
     assert file.notes == (shift_in_words(shift),) and not seen.moved and split.train
-    opened, _ = Checkpoint(training, reference).with_scene(tmp_path / "run/checkpoint.pt")
+    opened = Checkpoint(training, reference).with_scene(tmp_path / "run/checkpoint.pt").checkpoint
     assert opened.assumptions == [shift_in_words(shift)]  # which every command that opens a checkpoint says
     assert planned(TrainOptions(original, views=2), tmp_path / "run")[3].similarity is None
 
