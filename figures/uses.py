@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from analysis.commands.uses.options import GEOMETRY
+from analysis.commands.uses.options import GEOMETRY, TWICE
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from figures.scripts import folder_script
@@ -69,15 +69,15 @@ def draw_curve(curve: pd.DataFrame) -> Figure:
 
 def draw_gains(table: pd.DataFrame) -> Figure:
     """How far every candidate is behind the best, with twice its error, the picks first; the best by other rules are named."""
-    best, rows, equal = (
-        {rule: table[rule].idxmax() for rule in GEOMETRY},
+    best, rows, reach = (
+        {rule: np.nanargmax(table[rule].to_numpy(float)) for rule in GEOMETRY},
         range(len(table)),
-        table.behind <= 2 * table.error,
+        TWICE * table["error"],
     )
     with style():
         figure = new_figure(0.9 + 0.16 * len(table))
         axes = figure.subplots()
-        axes.errorbar(-table["behind"], rows, xerr=2 * table["error"], fmt="o", color=BLUE, markersize=3, linewidth=0.8)
+        axes.errorbar(-table["behind"], rows, xerr=reach, fmt="o", color=BLUE, markersize=3, linewidth=0.8)
         labels = []
         for place, (view, pick) in enumerate(zip(table["view"].tolist(), table["pick"].tolist(), strict=True)):
             named = [rule for rule, at in best.items() if at == place]
@@ -86,7 +86,7 @@ def draw_gains(table: pd.DataFrame) -> Figure:
         axes.set_yticks(rows, labels)
         axes.invert_yaxis()
         axes.set(xlabel="gain less that of the best, ± twice the error of the difference")
-        axes.set_title(f"{equal.sum()} of {len(table)} candidates are equal within their errors")
+        axes.set_title(f"{(table['behind'] <= reach).sum()} of {len(table)} candidates are equal within their errors")
         axes.grid(visible=True)
     return figure
 

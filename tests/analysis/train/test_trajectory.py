@@ -173,7 +173,8 @@ def test_quick_records_are_all_coarse_and_none_is_left_out(scene):
     assert main(probed(scene, "quick", "--probe-quick")) == 0
     table = rows(scene.parent / "quick")
     assert list(table["step"]) == list(range(0, STEPS + 1, EVERY)) and set(table["state"]) == {"coarse"}
-    assert table["lambda_max"].count() == len(table) and table["participation_ratio"].count() == 0
+    known = [sum(table[name].notna().tolist()) for name in ("lambda_max", "participation_ratio")]
+    assert known == [len(table), 0]
 
 
 def test_a_record_of_which_nothing_can_be_measured_says_why_and_whole_numbers_stay_so(
