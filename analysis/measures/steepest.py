@@ -110,7 +110,7 @@ def heaviest(
     random = masses(torch.empty_like(objective.active.flat).normal_(generator=generator), objective.active)
     whole = objective.active.flat.device.type == "cpu"
     sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views] if whole else []
-    found = []
+    values, found = sight_fields(sights) if whole else {}, []
     for vector in vectors:
         mass = masses(vector, objective.active)
         mass, i = mass / mass.sum(), int(mass.argmax())
@@ -124,7 +124,7 @@ def heaviest(
         )
         if whole:
             view = objective.views[_view_with_most(sights, i)]
-            one.shape = shape(_carrier(objective, view, vector, sight_fields(sights), mass, i), view)
+            one.shape = shape(_carrier(objective, view, vector, values, mass, i), view)
         found.append(one)
     return found
 

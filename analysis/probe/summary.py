@@ -109,8 +109,6 @@ def _carrier(end: Eigenvalue) -> str:
         return (
             f"{text}; number {place} from this end ({rough(value)}) is the first eigenvector on more than ten Gaussians"
         )
-    if carrier.found == 1:
-        return text
     if carrier.found < 2:
         return text
     return f"{text}; none of the first {carrier.found} eigenvectors from this end lies on more than ten Gaussians"

@@ -75,8 +75,9 @@ class Scene:
             backend_of(like).view_loss(view.image, self.objective.loss_settings, like) for view in self.objective.views
         ]
         cameras = [view.camera for view in self.objective.views]
+        background, settings = self.objective.background.to(self.dtype), self.objective.settings
         return RendererHessian(
-            lambda view: render(Gaussians.pack(named), cameras[view]).image,
+            lambda view: render(Gaussians.pack(named), cameras[view], background, settings).image,
             named,
             lambda image, view: view_loss(image.to(like), losses[view]),
             range(len(cameras)),
@@ -100,8 +101,7 @@ def trained(run: Path) -> Scene:
     """The scene of a training, at its checkpoint, with its views and its loss."""
     subject = open_subject(run)
     training, views = subject.checkpoint.training, subject.scene.load(subject.checkpoint.scene.train)
-    objective = SceneObjective(training.gaussians.to(torch.float64), views, training.config.loss)
-    return Scene(run.name, objective, torch.float32)
+    return Scene(run.name, training.config.objective(training.gaussians.to(torch.float64), views), torch.float32)
 
 
 def directions(blocks: dict[str, slice], dim: int, each: int) -> tuple[list[str], Tensor]:

@@ -194,14 +194,14 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 def _instead(path: Path) -> str:
     """Description of the thing at path that is no checkpoint, and which path to name instead."""
     if not path.exists():
-        near = path.parent if path.name == "checkpoint.pt" else path
+        near = path.parent if path.name == FILE else path
         beside = [each.name for each in near.parent.iterdir()] if near.parent.is_dir() else []
         return f"no such file{did_you_mean(near.name, beside)}"
-    if (inside := path / "checkpoint.pt").is_file():
+    if (inside := path / FILE).is_file():
         return f"a folder; name the {inside} in it"
     if runs := sorted(path.glob("*/checkpoint.pt")):
         return f"a folder of runs; name one of them, such as {runs[0].parent}"
-    if (path.parent / "checkpoint.pt").is_file():
+    if (path.parent / FILE).is_file():
         return f"a folder within the run {path.parent}; name that"
     return "a folder without one; name the run that landscape train wrote, its --out"
 
@@ -217,8 +217,8 @@ def _read(file: BinaryIO, path: Path) -> Any:
     except Exception as error:  # files of other kinds fail in torch with errors of many kinds
         if lacks_memory(error) or is_of_the_system(error):
             raise
-        runs = [folder for folder in path.absolute().parents[:2] if (folder / "checkpoint.pt").is_file()]
-        if runs and path.name != "checkpoint.pt" and not zipfile.is_zipfile(path):
+        runs = [folder for folder in path.absolute().parents[:2] if (folder / FILE).is_file()]
+        if runs and path.name != FILE and not zipfile.is_zipfile(path):
             raise InputError(f"{KIND}, got {path}, another file of the run {runs[0]}; name that run") from error
         ply = " (of other tools' files, probe, slice and convert read those)" if path.suffix.lower() == ".ply" else ""
         reason = next(iter(str(error).splitlines()), type(error).__name__)

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from tests.splat.model.files.written import zipped
+
 Random = random.Random
 WORDS = re.compile(r"[^\s,\[\]{}:=\"']+")
 NUMBERS = [
@@ -234,14 +236,6 @@ def _sog(chance: Random, content: bytes) -> bytes:
 def _members(content: bytes) -> dict[str, bytes]:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
-
-
-def zipped(members: dict[str, bytes]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    return buffer.getvalue()
 
 
 def rezipped(chance: Random, content: bytes) -> bytes:

@@ -15,7 +15,6 @@ from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import open_subject
 from splat.training.origin.options import Foreign
-from tests.hostile import mutations
 from tests.hostile.broken import Read, Reader
 from tests.hostile.mutations import Random
 from tests.hostile.records import RECORDS
@@ -167,5 +166,5 @@ if find_spec("gsply"):  # an optional package
     READERS |= {
         ".spz": model("scene.spz", written.spz),
         "compressed PLY": model("compressed.ply", _compressed),
-        ".sog": model("scene.sog", lambda made: mutations.zipped(sog(made)), 0),
+        ".sog": model("scene.sog", lambda made: written.zipped(sog(made)), 0),
     }

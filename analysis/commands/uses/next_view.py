@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from analysis.commands.uses.options import GEOMETRY, NextViewOptions
+from analysis.commands.uses.options import GEOMETRY, TWICE, NextViewOptions
 from analysis.console.drawing import draw_or_say
 from analysis.console.plain import say
 from analysis.console.stages import Stages
@@ -43,7 +43,6 @@ from splat.training.origin.scene_reference import data_of
 from splat.training.origin.subject import Checkpoint
 
 RECORD = "next-view.json"  # the file by which a folder of results is known
-TWICE = 2.0  # errors
 
 
 def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:

@@ -10,6 +10,7 @@ from analysis.console.options import CheckpointPath, OtherTools
 from splat.training.origin.options import Foreign
 
 GEOMETRY = ("coverage", "farthest", "uniform")  # rules of next-view that ask for no curvature
+TWICE = 2.0  # errors, within which its candidates are equal
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The bridge against double backward in float64, and against the exact operators of a trained scene of splats in float32."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import sqrt
 
 import pytest
@@ -10,7 +11,8 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.operators.renderer import renderer
 from landscape.operators.renderer.renderer import RendererHessian
-from tests.landscape.foreign import Bumps, by_block, trained
+from notebooks.renderer.scenes import demo, directions
+from tests.landscape.foreign import Bumps
 from tests.refusals import refused
 
 
@@ -208,9 +210,9 @@ def test_no_view_and_a_negative_noise_are_refused():
 
 def test_on_a_trained_scene_of_splats_in_float32_the_stated_errors_hold():
     """L1 + SSIM, jumps at 1/255 and in the depth order: a naive difference is off by more than the product's length."""
-    scene, generator = trained(), torch.Generator().manual_seed(0)
-    H = scene.hessian()
-    V = by_block(H.blocks, H.dim, generator, each=4)
+    scene = replace(demo(), dtype=torch.float32)
+    H = scene.foreign()
+    _, V = directions(H.blocks, H.dim, each=4)
     for operator, exact, bound in ((H, scene.exact, 0.25), (H.gauss_newton, scene.exact_gauss_newton, 0.05)):
         truth = exact.apply(V).clone()
         errors, stated = (operator.apply(V.float()) - truth).norm(dim=0), operator.error(V.float())

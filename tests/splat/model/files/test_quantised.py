@@ -4,7 +4,6 @@ import gzip
 import io
 import json
 import struct
-import zipfile
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from splat.model.files.read import read_splats
 from splat.model.gaussians import Gaussians
 from tests.refusals import refused
 from tests.splat.model.files import written
-from tests.splat.model.files.written import scene
+from tests.splat.model.files.written import scene, zipped
 
 HALF_BYTE = 0.5 / 255
 BANDS = {"bands": 3, "count": 65536, "codebook": [0.0] * 256, "files": ["quats.webp", "quats.webp"]}
@@ -113,14 +112,6 @@ def sog(true: Gaussians) -> dict[str, bytes]:
     meta |= {"sh0": {"codebook": colours.tolist(), "files": ["sh0.webp"]}}
     members = {f"{name}.webp": texture(values) for name, values in textures.items()}
     return {"meta.json": json.dumps(meta).encode(), **members}
-
-
-def zipped(members: dict[str, bytes]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    return buffer.getvalue()
 
 
 def test_sog_comes_back_within_its_tables(tmp_path):

@@ -8,6 +8,7 @@ nerfstudio `models/splatfacto.py`, Brush `brush-serde/src/export.rs`, Mip-Splatt
 import gzip
 import io
 import struct
+import zipfile
 from collections import OrderedDict
 from collections.abc import Callable
 
@@ -142,3 +143,11 @@ FILES: dict[str, Callable[[], bytes]] = {
     "old.ckpt": lambda: splatfacto(scene(), "_model."),
     "scene.splat": lambda: dot_splat(scene(0)),
 }
+
+
+def zipped(members: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()
