@@ -204,10 +204,13 @@ def test_what_a_product_takes_is_free_before_its_result_is_made():
     held = hold(gaussians, view, LossSettings(), torch.float32)
     U = random_like((gaussians.flat.numel(), 4), 8).float()
     result = held.hvp(U)  # the first one makes what is kept
-    tracemalloc.start()
-    held.hvp(U)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
+    peaks = []
+    for _ in range(3):  # other threads of the process can only add to what is traced
+        tracemalloc.start()
+        held.hvp(U)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    peak = min(peaks)
     cotangents = 4 * 9 * U.shape[1] * len(gaussians)  # of the splats: what the result is made of
     assert result.nbytes + cotangents <= peak <= result.nbytes + 1.5 * cotangents
 
