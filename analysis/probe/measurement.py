@@ -92,8 +92,9 @@ LEFT_OUT = {  # notes on stages that the settings exclude
     "finite probe": "the finite probe was left out",
     "depth": "positions along and across the rays were left out",
 }
-# longest step of renders along the ends: change of the loss, and from the optimiser's step
-RISE, MOST_DOUBLINGS = 0.01, 7
+# steps of renders along the ends: change of the loss by the longest, at most; from the optimiser's step to the shortest (three
+# such, a factor of 2 apart, reach a tenth of it) and to the longest
+RISE, HALVINGS, MOST_DOUBLINGS = 0.01, 5, 5
 MIXED = 0.1  # largest error of an eigenvector whose spread is told: 1% of its mass lies elsewhere
 FEW_POINTS = 8  # renders that tell the noise of one
 MOST_SAMPLES = 64  # of a trace on a CPU: more would take longer than summing the exact blocks
@@ -330,7 +331,7 @@ def _rendered(
         step = sum(share * lengths[name] ** 2 for name, share in shares.items()) ** 0.5
         reach = curvature_reach(value, RISE * at.value) if value and at.value > 0 else step
         doublings = min(max(ceil(log2(reach / step)), 1), MOST_DOUBLINGS) if step else 0
-        along = [step * 2.0**k for k in range(-at.settings.halvings, doublings + 1)]
+        along = [step * 2.0**k for k in range(-HALVINGS, doublings + 1)]
         probe = partial(finite_probe, objective.evaluate, objective.active.flat, pair.vectors[:, 0], at.operator)
         probes.append(probe(along, report, FEW_POINTS) if value and step else None)
         steps.append(step)

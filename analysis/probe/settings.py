@@ -26,7 +26,6 @@ class ProbeSettings:
         slice_plane: whether to render more than its two axes.
     probe_steps: of the finite probe, in stored units; (): it is left out.  noise_points: renders from which it tells the
         noise of a render.
-    halvings: of the optimiser's step, to the shortest at which the loss is rendered along both ends.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
     block_samples: of the share of H within the Gaussians' blocks; block_ssim_window: with SSIM's window, too.
     memory: GiB for the vectors of a basis.
@@ -46,7 +45,6 @@ class ProbeSettings:
     slice_tolerance: float = 0.01
     slice_plane: bool = True
     probe_steps: tuple[float, ...] = STEPS
-    halvings: int = 5
     depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=1024))
     depth_steps: tuple[float, ...] = DEPTH_STEPS
     noise_points: int = NOISE_POINTS
@@ -79,7 +77,6 @@ class ProbeSettings:
             slice_points=21,
             slice_plane=False,
             probe_steps=(),
-            halvings=2,
             depth=None,
             block_samples=4,
             block_ssim_window=False,

@@ -53,9 +53,10 @@ ONE, STEP = torch.ones(1, dtype=torch.float64), 2.0**-7
 DOUBLING = [0.7 * STEP * 2.0**k for k in range(-5, 6)]
 
 
-def judged(loss, curvature=2.0, least=STEP / 10):
-    along = finite_probe(lambda x: loss(float(x - 1)), ONE, ONE, DenseOperator(curvature * ONE[None]), DOUBLING)
-    return along.confirmation(least)
+def judged(loss, curvature=2.0, least=STEP / 10, steps=DOUBLING):
+    return finite_probe(
+        lambda x: loss(float(x - 1)), ONE, ONE, DenseOperator(curvature * ONE[None]), steps
+    ).confirmation(least)
 
 
 def test_doubling_steps_confirm_a_curvature_that_they_have():
@@ -77,6 +78,15 @@ def test_what_round_off_hides_is_neither_confirmed_nor_refuted():
     random = np.random.default_rng(0)
     for curvature in (2.0, -2.0):
         assert judged(lambda t: 1 + t**2 + 0.1 * random.standard_normal(), curvature) == (None, None)
+
+
+@pytest.mark.parametrize("shortest", [0, 3, 5])
+def test_what_a_resolved_step_refutes_is_not_confirmed_however_many_shorter_ones_round_off_hides(shortest):
+    random, noise = np.random.default_rng(0), DOUBLING[5] ** 2 / 10
+    assert judged(lambda t: 1 + t**2 + noise * random.standard_normal(), -2.0, steps=DOUBLING[shortest:]) == (
+        False,
+        None,
+    )
 
 
 def test_the_measured_noise_is_unbiased():
