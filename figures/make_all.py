@@ -10,12 +10,13 @@ from pathlib import Path
 
 from analysis.console.failures import program
 from analysis.records.records import ProbeRecord, Record, read_record
-from figures import slice1d, slice2d, spectrum, surface, traces
+from figures import places, slice1d, slice2d, spectrum, surface, traces
 from figures.scripts import folder_script
 from figures.style import save
 from landscape.errors import TooLittleMemory
 
 FIGURES = {
+    "places": places.draw,
     "traces": traces.draw,
     "spectrum": spectrum.draw,
     "slice1d": slice1d.draw,
@@ -29,6 +30,7 @@ def recorded_figures(record: Record) -> tuple[str, ...]:
     slice = record.data.slice if "slice" in record.arrays else None
     axes = len(slice.directions) if slice else 0
     known = {"traces": isinstance(record.data, ProbeRecord), "spectrum": "spectrum" in record.arrays}
+    known |= {"places": "places" in record.arrays}
     known |= {"slice1d": axes == 1, "slice2d": axes == 2, "surface": axes == 2 and bool(slice and slice.is_resolved)}
     return tuple(name for name in FIGURES if known[name])
 

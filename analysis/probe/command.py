@@ -72,7 +72,7 @@ def _run(
     """The probe in this process.  ranks: of the processes that share the views, where there are several."""
     start, begun = perf_counter(), monotonic()
     out = options.out or options.checkpoint.parent / ("probe-quick" if options.quick else "probe")
-    settings, families = _settings(options), _family_options(options)
+    settings, families = probe_settings(options), _family_options(options)
     limit = inf if options.seconds is None else options.seconds
     if ranks is not None:
         _require_same_in_all_processes(limit, families)
@@ -109,7 +109,7 @@ def _run(
     if writes:
         if not found.unreached:
             shutil.rmtree(unfinished, ignore_errors=True)
-        _conclude(data, out, options.verbose, guessed)
+        conclude(data, out, options.verbose, guessed)
     failed = any(check.passed is False for check in data.checks.values())
     return CHECK_FAILED if options.strict and failed else 0
 
@@ -138,7 +138,7 @@ def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[No
 def asked(options: ProbeOptions, checkpoint: Checkpoint) -> Fingerprint:
     """What the numbers of a probe with these options are about.  checkpoint: thinned as they say."""
     families = _family_options(options)
-    settings = asdict(_settings(options)) | ({} if families is None else {"per_attribute": asdict(families)})
+    settings = asdict(probe_settings(options)) | ({} if families is None else {"per_attribute": asdict(families)})
     return checkpoint.fingerprint(settings, options.seed, LossSettings() if options.loss == "3dgs" else None)
 
 
@@ -179,7 +179,7 @@ def _write(
     write_report(folder)
 
 
-def _settings(options: ProbeOptions) -> ProbeSettings:
+def probe_settings(options: ProbeOptions) -> ProbeSettings:
     if options.seconds is not None and not options.seconds > 0:
         raise InputError(f"expected --seconds above 0, got {options.seconds:g}")
     settings = ProbeSettings.quick() if options.quick else ProbeSettings()
@@ -218,7 +218,7 @@ def _expected(objective: SceneObjective, settings: ProbeSettings, further: float
     return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
 
 
-def _conclude(data: ProbeRecord, out: Path, verbose: bool, guessed: Sequence[str]) -> None:
+def conclude(data: ProbeRecord, out: Path, verbose: bool, guessed: Sequence[str]) -> None:
     """Print the summary (verbose: and the tables), what failed and what is not known, with remedies."""
     from analysis.records.report import FILE as REPORT
 

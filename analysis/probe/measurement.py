@@ -28,7 +28,7 @@ from math import ceil, inf, log2
 from pathlib import Path
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from analysis.console.kept import Kept
@@ -353,20 +353,38 @@ def _shares(at: _Point, generator: torch.Generator, report: Progress, _: list[st
 def _plane(
     at: _Point, ends: EigenEnds, generator: torch.Generator, report: Progress, notes: list[str]
 ) -> PlaneSlice | None:
-    settings, center, loss_scale = at.settings, at.objective.active.flat, at.settings.slice_rise * at.value
-    curvatures: Float64[Tensor, 2] = ends.largest.values[:2]
+    center = at.objective.active.flat
+    workers = thread_count() if backend_of(center) is CPU else 1
+    loss = evaluation(at.objective, workers)
+    return plane_of(loss, center, at.value, at.gradient, ends, at.settings, workers, generator, report, notes)
+
+
+def plane_of(
+    loss: Loss,
+    center: Float[Tensor, " n"],
+    value: float,
+    gradient: Float[Tensor, " n"],
+    ends: EigenEnds,
+    settings: ProbeSettings,
+    workers: int,
+    generator: torch.Generator,
+    report: Progress,
+    notes: list[str],
+) -> PlaneSlice | None:
+    """The loss over the plane of the two steepest directions; None where a note says why.  value, gradient: at center."""
+    loss_scale, curvatures = settings.slice_rise * value, ends.largest.values[:2]
     if loss_scale <= 0 or not curvatures.all():
         notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")
         return None
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
-    workers = thread_count() if backend_of(center) is CPU else 1
     most = inf if settings.slice_plane else 1  # 1: the two axes alone
     accuracy = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most)
     # E^T H E of Ritz vectors E is diagonal: no product is needed
-    known, evaluate = curvatures.diag(), evaluation(at.objective, workers)
-    plane = evaluate_slice(evaluate, center, vectors, axes, at.gradient, known, accuracy, generator, progress=report)
+    plane = evaluate_slice(
+        loss, center, vectors, axes, gradient, curvatures.diag(), accuracy, generator, progress=report
+    )
     return PlaneSlice(plane, loss_scale, (first, second))
 
 

@@ -41,14 +41,12 @@ def probe_record(
         objective=objective_of(objective, found.value, found.gradient_norm, of_loss),
         traces={name: _trace(trace, left_out, seen.get(name)) for name, trace in found.traces.items()},
         eigenvalues=_eigenvalues(found, objective),
-        anisotropy=_anisotropy(found),
-        concentration=UNSET if found.density is None else _concentration(found.density),
-        finite_probe=None
-        if found.finite is None
-        else convert({**found.finite.record(), "direction": NAMES[0]}, schema.FiniteProbe),
+        anisotropy=anisotropy_record(found.ends, found.density, found.power),
+        concentration=concentration_record(found.density),
+        finite_probe=found.finite and finite_record(found.finite),
         depth=found.depth,
         block_shares=UNSET if found.shares is None else [_block_share(one) for one in found.shares],
-        slice=None if found.plane is None else _slice(found.plane, found.ends.largest),
+        slice=found.plane and slice_record(found.plane, found.ends.largest),
         counts=_counts(found, objective),
         checks=_checks(found, objective.counts.views),
         notes=[
@@ -64,17 +62,23 @@ def probe_record(
 
 def probe_arrays(found: Measured) -> dict[str, dict[str, np.ndarray]]:
     """The arrays, by file (`analysis.records.records.ARRAYS`)."""
-    assert found.ends.ritz is not None
-    values, residuals = found.ends.ritz.numpy()
+    return arrays_of(found.traces, found.ends, found.density, found.plane)
+
+
+def arrays_of(
+    traces: Mapping[str, TraceEstimate], ends: EigenEnds, density: SpectralDensity | None, plane: PlaneSlice | None
+) -> dict[str, dict[str, np.ndarray]]:
+    assert ends.ritz is not None
+    values, residuals = ends.ritz.numpy()
     arrays = {
-        "traces": {name: trace.samples.numpy() for name, trace in found.traces.items()},
+        "traces": {name: trace.samples.numpy() for name, trace in traces.items()},
         "spectrum": {"ritz_values": values, "residuals": residuals},
-        "eigenvectors": {end: getattr(found.ends, end).vectors.cpu().numpy() for end in ("largest", "smallest")},
+        "eigenvectors": {end: getattr(ends, end).vectors.cpu().numpy() for end in ("largest", "smallest")},
     }
-    if found.density is not None:
-        arrays["spectrum"] |= dict(zip(("nodes", "weights"), (x.numpy() for x in found.density.table()), strict=True))
-    if found.plane is not None:
-        arrays["slice"] = found.plane.slice.arrays()
+    if density is not None:
+        arrays["spectrum"] |= dict(zip(("nodes", "weights"), (x.numpy() for x in density.table()), strict=True))
+    if plane is not None:
+        arrays["slice"] = plane.slice.arrays()
     return arrays
 
 
@@ -136,7 +140,7 @@ def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalu
         for end, (probe, step, kinks, carrier, spreads) in zip((rows.max, rows.min), rendered, strict=True):
             wide = [(i + 1, *pair) for i, pair in enumerate(spreads) if pair[1] > TEN]
             end.carrier = structs.replace(carrier, found=len(spreads), wide=wide[0] if wide else UNSET)
-            end.renders = UNSET if probe is None else _renders(probe, step, kinks)
+            end.renders = UNSET if probe is None else renders_record(probe, step, kinks)
     if found.left_out is not None:
         for end, curvatures in zip((rows.max, rows.second, rows.min), found.left_out.curvatures.T, strict=True):
             if end:
@@ -145,8 +149,8 @@ def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalu
     return rows
 
 
-def _renders(probe: FiniteProbe, step: float, kinks: float) -> schema.Renders:
-    """step: the optimiser's along this direction."""
+def renders_record(probe: FiniteProbe, step: float = 0.0, kinks: float = 0.0) -> schema.Renders:
+    """step: the optimiser's along this direction; 0 where it is not known."""
     confirmed, steps = probe.confirmation(step / 10)
     low, high = steps or (None, None)
     numbers = {
@@ -170,18 +174,22 @@ def without_one(curvatures: Float64[Tensor, " m"]) -> tuple[float, float] | Unse
     return float(means.min()), float(means.max())
 
 
-def _anisotropy(found: Measured) -> schema.Anisotropy:
+def anisotropy_record(
+    ends: EigenEnds, density: SpectralDensity | None, power: EigenEnds | None = None
+) -> schema.Anisotropy:
     """All indices; those that need the density are undetermined without it."""
-    family = anisotropy(found.ends, found.density)
+    family = anisotropy(ends, density)
     left_out = schema.Index(value=None, low=None, high=None, note=NEEDS_DENSITY)
     known = {name: getattr(family, name) for name in schema.INDICES}
     indices = schema.Anisotropy(**{name: index_of(bracket) if bracket else left_out for name, bracket in known.items()})
-    if found.power is not None:
-        indices.eigenvalue_ratio = paper_index(found.ends, found.power)
+    if power is not None:
+        indices.eigenvalue_ratio = paper_index(ends, power)
     return indices
 
 
-def _concentration(density: SpectralDensity) -> schema.Concentration:
+def concentration_record(density: SpectralDensity | None) -> schema.Maybe[schema.Concentration]:
+    if density is None:
+        return UNSET
     brackets = {"half": half(density), "top_10": top(density, 10), "top_100": top(density, 100)}
     return schema.Concentration(**{name: index_of(bracket) for name, bracket in brackets.items()})
 
@@ -208,7 +216,12 @@ def _unreached(found: Measured) -> list[str]:
     return [f"time ended before: {', '.join(found.unreached)}; the same command continues from there"]
 
 
-def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
+def finite_record(probe: FiniteProbe) -> schema.FiniteProbe:
+    """Along the first eigenvector."""
+    return convert({**probe.record(), "direction": NAMES[0]}, schema.FiniteProbe)
+
+
+def slice_record(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
     x, y = (float(axis.abs().max()) for axis in plane.slice.coordinates)
     units = [reach / unit for reach, unit in zip((x, y), plane.units, strict=True)]
     numbers = zip(NAMES, pairs.values.tolist(), pairs.residuals.tolist(), plane.units, strict=False)

@@ -32,6 +32,8 @@ def summary(data: ProbeRecord, report: Path) -> list[str]:
         "negative" if (ends.min.value or 0.0) < 0 else "lowest": _end(ends.min),
         "seeds": f"{ONE}: other seeds give other extreme eigenvalues (landscape compare, three seeds of each)",
     }
+    if not counts.gaussians:  # of a renderer that is not ours
+        lines |= {"scene": f"{made.scene}, {_views(counts)}; {counts.parameters:,} parameters", "seeds": ""}
     if doubtful := _doubtful(data):
         words = f"the check of {' and '.join(doubtful)} failed, which puts every curvature in doubt: none is told"
         lines = {"scene": lines["scene"], "curvature": words}
@@ -85,7 +87,7 @@ def _end(end: Eigenvalue) -> str:
         return f"{UNDETERMINED} (not reached)"
     value, renders = end.value or 0.0, end.renders
     notes = [ONE]
-    if renders and (value > 0 or renders.confirmed):
+    if renders and renders.optimiser_step and (value > 0 or renders.confirmed):
         at = renders.at_step
         over = "hidden by round-off" if at is None else rough(at * value)
         kinks = f", where kinks of L1 add {rough(renders.kinks)}" if renders.kinks else ""

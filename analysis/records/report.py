@@ -51,6 +51,7 @@ PICTURES = {
     "surface": "The same plane as a surface.",
     "spectrum": "The density of the spectrum, broadened; the share of all directions and of all curvature below a value; the "
     "eigenvalues that the search for the ends met, each with the residual within which a true one lies.",
+    "places": "Each position along two axes of the scene, in the colour of the largest curvature of its own block.",
     "traces": "The trace of each attribute's block of the Hessian, in units of its own: the rows do not compare.",
 }
 COMPARED = (  # of the traces, where the record has these steps
@@ -183,7 +184,7 @@ def opening(data: ProbeRecord, mapped: MapRecord | None) -> list[Line]:
 
 def subtitle(data: ProbeRecord) -> str:
     """Gaussians, the loss and its formula, the pictures' size, and the gradient, as far as they are known."""
-    loss, parts = data.objective, [f"{data.counts.gaussians:,} Gaussians"]
+    loss, parts = data.objective, [f"{data.counts.gaussians:,} Gaussians"] if data.counts.gaussians else []
     if loss.value is not None:
         parts.append(f"loss {quantity(loss.value)}" + (f" = {loss.loss}" if loss.loss else ""))
     if sizes := {tuple(size) for size in loss.sizes or []}:

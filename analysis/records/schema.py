@@ -173,14 +173,14 @@ class Renders(Struct, kw_only=True):
     steps: along v, stored units, each twice the one before; ratios: to the quadratic model, of the second difference to the
     eigenvalue; errors: of these, four standard errors of round-off.  confirmed: null where round-off decides; low, high: of
     the steps that confirm.  optimiser_step: the root mean square length along v of a step with random signs, as long as the
-    optimiser's first in every parameter: one of the steps.  kinks: the curvature of L1's kinks along v, which the eigenvalue
-    leaves out (`analysis.measures.steepest`).
+    optimiser's first in every parameter: one of the steps; 0 where not known.  kinks: the curvature
+    of L1's kinks along v, which the eigenvalue leaves out (`analysis.measures.steepest`).
     """
 
     confirmed: bool | None
     low: Number = None
     high: Number = None
-    optimiser_step: NonNegative
+    optimiser_step: NonNegative = 0.0
     kinks: NonNegative = 0.0
     steps: list[float]
     ratios: list[Number]
@@ -188,7 +188,9 @@ class Renders(Struct, kw_only=True):
 
     @property
     def at_step(self) -> Number:
-        """The ratio at the optimiser's step; None where round-off hides it."""
+        """The ratio at the optimiser's step; None where it is not known or round-off hides it."""
+        if not self.optimiser_step:
+            return None
         i = self.steps.index(self.optimiser_step)
         ratio, error = self.ratios[i], self.errors[i]
         return ratio if ratio is not None and error is not None and abs(ratio) > error else None

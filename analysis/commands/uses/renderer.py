@@ -1,37 +1,50 @@
 """`landscape probe FILE.py:FACTORY`: the landscape of somebody else's renderer, the `RendererHessian` that FACTORY() returns.
 
-The file is run because it was named, from that path alone; nothing is put on Python's path.
-
-OUT/renderer.json, by default in FACTORY-probe beside the file: the check of the renderer, passes of a product, traces of
-Gauss-Newton, both ends of the spectrum with the errors of products, and renders along the steepest direction.
+The file is run because it was named, from that path alone; nothing is put on Python's path.  Record, pictures and page are
+those of a scene's probe, less what needs Gaussians, in FACTORY-probe beside the file.  Traces are those of Gauss-Newton; errors
+of eigenvalues have those of products in them.  Three numbers a row named "means" are positions: a picture shows where these
+are steep.
 """
 
 import re
+import shlex
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import replace
 from importlib.util import module_from_spec, spec_from_file_location
-from math import sqrt
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
-import msgspec
+import numpy as np
 import torch
+from msgspec import UNSET, convert
+from rich.console import Console
 
 from analysis.console.drawing import Draw
 from analysis.console.plain import say
-from analysis.probe.command import CHECK_FAILED, run_probe
+from analysis.console.recording import write_with_pictures
+from analysis.console.stages import Stages
+from analysis.measures.localization import mass_shares
+from analysis.probe import record
+from analysis.probe.command import CHECK_FAILED, conclude, probe_settings, run_probe
+from analysis.probe.measurement import RISE, plane_of
 from analysis.probe.options import ProbeOptions
-from analysis.records.json_files import json_text
+from analysis.records import schema
 from analysis.records.provenance import provenance, require_seed
-from analysis.records.records import record_folder
-from landscape import EigenSettings, RendererHessian, check_renderer, gauss_newton_traces, renderer_eigenpairs
-from landscape.eigen.pairs import Eigenpairs
+from analysis.records.records import Arrays, Check, Counts, ProbeRecord, record_folder
+from analysis.records.report import write_report
+from landscape import RendererHessian, check_renderer, gauss_newton_traces, renderer_eigenpairs, spectral_density
+from landscape.eigen.pairs import EigenEnds, Eigenpairs
 from landscape.errors import InputError
+from landscape.operators.renderer.check import UNRESOLVED, WRONG
+from landscape.slices.finite_probe import finite_probe
+from landscape.slices.slices import curvature_reach
+from landscape.traces.pixels import gauss_newton_blocks
+from splat.curvature.traces import curvature_scale
 
-FILE = "renderer.json"
 NAMED = re.compile(r"(.+\.py):([^\W\d]\w*)")
-USED = {"checkpoint", "out", "seed", "strict", "quick", "end_products", "slice_rise"}
-STEPS = (-3, -2, -1, 1, 2, 3)  # in curvature units
+UNUSED = ("device", "loss", "seconds", "power", "per_attribute", "split_control", "metric", "memory", "foreign")
+POSITIONS, HALVINGS = "means", 7  # of the step along an end that changes the loss by RISE
 
 
 def run_any_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
@@ -40,18 +53,24 @@ def run_any_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Dra
         return run_probe(options, command, drawn)
     require_seed(options.seed)
     default = ProbeOptions(options.checkpoint)
-    for name in (field.name for field in fields(options) if field.name not in USED):
+    for name in UNUSED:
         if getattr(options, name) != getattr(default, name):
             raise InputError(f"expected of a renderer no --{name.replace('_', '-')}, got one; leave it out")
-    path, name = Path(found[1]), found[2]
-    hessian = made_by(path, name)
-    with record_folder(options.out or path.parent / f"{name}-probe", FILE) as folder:
-        data = {"provenance": msgspec.to_builtins(provenance(options.seed, command=" ".join(command)))}
-        data |= _measured(hessian, options)
-        (folder / FILE).write_text(json_text(data), encoding="utf-8")
-    failed = [*data["check"]["sentences"]]
-    say(*_summary(data), *failed)
-    return CHECK_FAILED if options.strict and failed else 0
+    start, path, name = perf_counter(), Path(found[1]), found[2]
+    hessian, stages = made_by(path, name), Stages(Console(stderr=True))
+    out = options.out or path.parent / f"{name}-probe"
+    with record_folder(out) as folder, stages:
+        data, arrays = _measured(hessian, options, stages)
+        data.provenance = provenance(
+            options.seed,
+            command=shlex.join(command),
+            scene=f"{name}() of {path.name}",
+            checkpoint=str(options.checkpoint),
+        )
+        write_with_pictures(folder, data, arrays, stages, start, drawn)
+        write_report(folder)
+    conclude(data, out, options.verbose, [])
+    return CHECK_FAILED if options.strict and not all(check.passed for check in data.checks.values()) else 0
 
 
 def made_by(path: Path, name: str) -> RendererHessian:
@@ -74,55 +93,87 @@ def made_by(path: Path, name: str) -> RendererHessian:
     return found
 
 
-def _measured(hessian: RendererHessian, options: ProbeOptions) -> dict[str, Any]:
-    """The record; says the work first."""
-    samples, rtol, most = (8, 0.1, 60) if options.quick else (32, 0.01, 300)
-    settings = EigenSettings(rtol=rtol, max_matvecs=options.end_products or most)
-    renders, backwards = hessian.passes(vectors=1)
+def _measured(hessian: RendererHessian, options: ProbeOptions, stages: Stages) -> tuple[ProbeRecord, Arrays]:
+    """The record without its provenance, and its arrays; says the work first."""
+    settings, (renders, backwards) = probe_settings(options), hessian.passes(vectors=1)
+    most = options.end_products or (60 if options.quick else 300)
+    eigen = replace(settings.eigen, max_matvecs=most, further=0)
     say(
         f"{len(hessian.views)} views, {hessian.dim:,} parameters; H v takes {renders} renders and {backwards} backward passes, "
-        f"and there are {4 * len(hessian.blocks) + 8} to {settings.max_matvecs + 4 * len(hessian.blocks) + 8} of them"
+        f"and there are at most {most + settings.density_matvecs + 4 * len(hessian.blocks) + 12} of them"
     )
-    generator = torch.Generator(hessian.parameters.device).manual_seed(options.seed)
-    check = check_renderer(hessian, generator)
-    traces = gauss_newton_traces(hessian, generator, samples)
-    ends = renderer_eigenpairs(hessian, generator, settings)
-    return {
-        "value": hessian.value,
-        "gradient_norm": float(torch.linalg.vector_norm(hessian.gradient.double())),
-        "passes": {"renders": renders, "backward": backwards},
-        "check": check.record() | {"sentences": check.sentences},
-        "traces": {name: trace.record() for name, trace in traces.items()},
-        "eigenvalues": {name: _end(getattr(ends, name)) for name in ("largest", "smallest")},
-        "slice": _slice(hessian, ends.largest, options.slice_rise),
-    }
+    generator, notes = torch.Generator(hessian.parameters.device).manual_seed(options.seed), []
+    with stages.stage("checks"):
+        check = check_renderer(hessian, generator)
+    with stages.stage("traces"):
+        traces = gauss_newton_traces(hessian, generator, 8 if options.quick else 32)
+    with stages.stage("eigenvalues") as report:
+        ends = renderer_eigenpairs(hessian, generator, eigen, progress=report)
+    with stages.stage("renders"):
+        probes = [_along(hessian, pairs) for pairs in (ends.largest, ends.smallest)]
+    with stages.stage("slice") as report:
+        at = hessian.loss_at, hessian.point, hessian.value, hessian.gradient, ends, settings
+        plane = plane_of(*at, 1, generator, report, notes)
+    density = None
+    if settings.density_matvecs:
+        with stages.stage("density") as report:
+            density = spectral_density(hessian, generator, settings.density_matvecs, ends=ends, progress=report)
+    arrays = record.arrays_of(traces, ends, density, plane)
+    if POSITIONS in hessian.blocks and hessian.parameters.tensors[0].shape[1:] == (3,):
+        arrays["places"] = _places(hessian, generator)
+    off = max((abs(ratio) - 2 * spread for ratio, spread in check.gradients.values()), default=0.0)
+    return ProbeRecord(
+        objective=schema.Objective(operator="hessian", value=hessian.value, gradient_norm=float(hessian.gradient.norm())),
+        traces={name: _trace(trace.record()) for name, trace in traces.items()},
+        eigenvalues=_ends(hessian, ends, probes),
+        anisotropy=record.anisotropy_record(ends, density),
+        concentration=record.concentration_record(density),
+        finite_probe=probes[0] and record.finite_record(probes[0]),
+        slice=plane and record.slice_record(plane, ends.largest),
+        counts=Counts(
+            gaussians=0, visible_gaussians=0, parameters=hessian.dim, active_parameters=hessian.dim, sh_degree_stored=0,
+            sh_degree_active=0, views=len(hessian.views), products=ends.matvecs,
+        ),
+        checks={
+            "gradient": Check(value=off, bound=WRONG, passed=off <= WRONG),
+            "products": Check(value=check.error, bound=UNRESOLVED, passed=check.error < UNRESOLVED),
+        },
+        notes=[*notes, *check.sentences, "traces are those of Gauss-Newton"],
+        provenance=provenance(options.seed),
+        timing=stages.timing,
+    ), arrays  # fmt: skip
 
 
-def _end(pairs: Eigenpairs) -> dict[str, Any]:
-    return {"value": float(pairs.values[0]), "error": float(pairs.residuals[0]), "reason": pairs.reason}
+def _along(hessian: RendererHessian, pairs: Eigenpairs) -> Any:
+    """Losses along an eigenvector, to the step at which its curvature changes the loss by RISE; None of an eigenvalue 0."""
+    if not (value := float(pairs.values[0])) or hessian.value <= 0:
+        return None
+    reach = curvature_reach(value, RISE * hessian.value)
+    steps = [reach / 2**k for k in range(HALVINGS, -1, -1)]
+    return finite_probe(hessian.loss_at, hessian.point, pairs.vectors[:, 0], hessian, steps)
 
 
-def _slice(hessian: RendererHessian, largest: Eigenpairs, rise: float) -> list[dict[str, float]]:
-    """Losses along the steepest direction, beside those of the quadratic; a unit raises the loss by this share."""
-    curvature, v = float(largest.values[0]), largest.vectors[:, 0]
-    if curvature <= 0:
-        return []
-    unit, slope = sqrt(2 * rise * hessian.value / curvature), float(hessian.gradient.double() @ v.double())
-    return [
-        {
-            "step": step * unit,
-            "loss": float(hessian.loss_at(hessian.point + step * unit * v)),
-            "quadratic": hessian.value + step * unit * slope + curvature * (step * unit) ** 2 / 2,
-        }
-        for step in STEPS
-    ]
+def _trace(numbers: dict[str, Any]) -> schema.Trace:
+    tau = curvature_scale(numbers["value"], numbers["dim"], 1, "active")
+    return convert({**numbers, "tau": tau, "method": "Gauss-Newton, by backward passes"}, schema.Trace)
 
 
-def _summary(data: dict[str, Any]) -> list[str]:
-    ends, check = data["eigenvalues"], data["check"]
-    lines = [f"{name:<9} {end['value']:.2g} +- {end['error']:.1g} ({end['reason']})" for name, end in ends.items()]
-    lines += [
-        f"trace     of Gauss-Newton in {name}: {trace['value']:.2g} ({trace['low']:.2g} to {trace['high']:.2g})"
-        for name, trace in data["traces"].items()
-    ]
-    return [*lines, f"checks    {'all passed' if check['passed'] else 'failed:'}"]
+def _ends(hessian: RendererHessian, ends: EigenEnds, probes: Sequence[Any]) -> schema.Eigenvalues:
+    def end(pairs: Eigenpairs, index: int, probe: Any = None) -> schema.Eigenvalue:
+        shares = mass_shares(pairs.vectors[:, index], hessian.blocks)
+        found = schema.Eigenvalue(**pairs.record(index), matvecs=ends.matvecs, method=ends.method, shares=shares)  # pyright: ignore[reportArgumentType]
+        found.renders = UNSET if probe is None else record.renders_record(probe)
+        return found
+
+    return schema.Eigenvalues(
+        max=end(ends.largest, 0, probes[0]), second=end(ends.largest, 1), min=end(ends.smallest, 0, probes[1])
+    )
+
+
+def _places(hessian: RendererHessian, generator: torch.Generator) -> dict[str, np.ndarray]:
+    """Positions, and the largest eigenvalue of each one's block of Gauss-Newton."""
+    rows = hessian.blocks[POSITIONS]
+    groups = torch.arange(rows.start, rows.stop, device=hessian.point.device).reshape(-1, 3)
+    blocks = gauss_newton_blocks(hessian, generator, groups).values
+    largest = torch.linalg.eigvalsh(blocks)[:, -1]
+    return {"positions": hessian.point[groups].double().cpu().numpy(), "curvature": largest.cpu().numpy()}

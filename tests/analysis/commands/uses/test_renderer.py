@@ -1,20 +1,21 @@
 """`landscape probe FILE.py:FACTORY` runs that file alone, and its record has what a renderer's products tell."""
 
-import json
+import math
 import re
 import sys
 
 import pytest
 
 from analysis.commands.cli import main
+from analysis.records.records import read_record
 
 FACTORY = """
 import torch
 from landscape import RendererHessian
 
 def make():
-    x = torch.tensor([0.5, 2.0], dtype=torch.float64, requires_grad=True)
-    return RendererHessian(lambda t: torch.exp(t * x), {"x": x}, lambda image, t: image.square().sum() / 2, [1.0])
+    x = torch.tensor([[0.0, 0.5, 2.0]], dtype=torch.float64, requires_grad=True)
+    return RendererHessian(lambda t: torch.exp(t * x), {"means": x}, lambda image, t: image.square().sum() / 2, [1.0])
 
 def wrong():
     return 1
@@ -30,17 +31,28 @@ def file(tmp_path):
     return tmp_path / "theirs.py"
 
 
-def test_a_renderer_is_probed(file, capsys):
+def test_a_renderer_is_probed_as_a_scene_is(file, capsys):
     path, names = list(sys.path), set(sys.modules)
     assert main(["probe", f"{file}:make", "--quick", "--strict"]) == 0
     assert sys.path == path and "theirs" not in set(sys.modules) - names
-    data, said = json.loads((file.parent / "make-probe" / "renderer.json").read_text()), capsys.readouterr().out
-    top = 2 * 2.718281828459045**4
-    assert abs(data["eigenvalues"]["largest"]["value"] - top) <= data["eigenvalues"]["largest"]["error"] < 0.1 * top
-    assert data["check"]["passed"] and data["passes"] == {"renders": 5, "backward": 3}
-    assert "H v takes 5 renders and 3 backward passes" in said and "largest   1.1e+02 +-" in said
-    for point in data["slice"]:
-        assert point["loss"] == pytest.approx(point["quadratic"], rel=1e-3)
+    record, said = read_record(file.parent / "make-probe"), capsys.readouterr()
+    data, (x, y) = record.data, (math.exp(2 * 0.5), math.exp(2 * 2.0))
+    top = data.eigenvalues.max
+    assert abs(top.value - 2 * y) <= top.residual < 0.1 * y and top.renders.confirmed
+    trace = data.traces["means"]
+    assert trace.low < x + y < trace.high  # of Gauss-Newton: e^2x, a pixel each
+    assert all(check.passed for check in data.checks.values())
+    assert "H v takes 5 renders and 3 backward passes" in " ".join(said.out.split())
+    assert re.search(r"scene +make\(\) of theirs.py, 1 views; 3 parameters", said.out) and "Gaussian " not in said.out
+    middle = record.arrays["slice"]["loss"].shape[0] // 2
+    assert record.arrays["slice"]["loss"][middle, middle] == pytest.approx((1 + x + y) / 2)
+    # a position's own block of J^T J is diagonal: its largest number is that of y, sampled with 32 signs
+    assert record.arrays["places"]["curvature"].tolist() == pytest.approx([y], rel=0.7)
+    page = (file.parent / "make-probe" / "report.html").read_text()
+    assert "Loss landscape of make() of theirs.py, 1 view" in page and "0 Gaussians" not in page
+    assert all(
+        (file.parent / "make-probe" / f"{name}.png").is_file() for name in ("places", "slice2d", "spectrum", "traces")
+    )
 
 
 @pytest.mark.parametrize(
