@@ -163,7 +163,8 @@ def draw_slices(records: Records) -> Figure:
         scales = "" if same else " (axes differ in scale)"
         figure.supxlabel(f"step along the steepest direction, stored units{unit_suffix(exponent)}{scales}", fontsize=7)
         figure.supylabel(f"step along the second{unit_suffix(exponent)}", fontsize=7)
-        figure.colorbar(filled, ax=panels, label=f"change of loss{unit_suffix(power)}")  # pyright: ignore[reportArgumentType]
+        change = f"change of loss{unit_suffix(power)}"
+        figure.colorbar(filled, ax=panels, label=change, ticks=MaxNLocator(LEVELS // 2))  # pyright: ignore[reportArgumentType]
     return figure
 
 

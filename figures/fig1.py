@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
@@ -67,7 +68,7 @@ def draw(runs: Sequence[Path]) -> Figure:
             if i == 0:
                 across.set_ylabel(scale.loss_label)
             else:
-                above.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9)
+                above.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=MaxNLocator(5))
         handles = [Line2D([], [], color=BLACK, label="along e₁")]
         handles.append(Line2D([], [], color=BLACK, linestyle="--", label="along e₂"))
         above.legend(handles=handles, loc="outside lower center", ncols=2)

@@ -16,6 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from analysis.console.failures import program
+from analysis.records.quantities import rough
 from analysis.records.run_files import RECORDS, read_trajectory
 from figures.manifold import Scale, landscape_of, require_same_function, section, start_of, surface
 from figures.scripts import runs_script
@@ -49,7 +50,7 @@ def draw(runs: Sequence[Path]) -> Figure:
         index.grid(True)
         drawn = [surface(figure, (2, 3, 2 + i), end, scale, f"{names[i]}, end") for i, end in enumerate(ends)]
         figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], **BAR)
-        title = f"{BEGINNING}, steps × {wide.reach / scale.reach:.2g}"
+        title = f"{BEGINNING}, steps × {rough(wide.reach / scale.reach)}"
         around, colours = surface(figure, (2, 3, 4), start, wide, title)
         figure.colorbar(colours, ax=around, **BAR)
         for axis, direction in enumerate(("e₁", "e₂")):

@@ -25,7 +25,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.transforms import Affine2D, Bbox, TransformedBbox
 
 from analysis.console.failures import program
-from analysis.records.quantities import BYTES, Shade, percent, quantity
+from analysis.records.quantities import BYTES, Shade, percent, quantity, rough
 from analysis.records.run_files import (
     END_MAPS,
     VIEW_MAPS,
@@ -139,7 +139,7 @@ def ticks_of(shade: Shade) -> list[tuple[float, str]]:
         return shade.ticks()
     values = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(shade.low, shade.high)
     inside = [float(value) for value in values if shade.low <= value <= shade.high]
-    return [(float(shade.share(np.array(value))), f"{value:.4g}".replace("-", "−")) for value in inside]
+    return [(float(shade.share(np.array(value))), f"{value:.3g}".replace("-", "−")) for value in inside]
 
 
 def draw(maps: dict[str, np.ndarray], panel: Panel, record: MapRecord) -> Figure:
@@ -229,7 +229,7 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
 
 
 def _signed(share: float) -> str:
-    return f"{share:+.2%}".replace("-", "−")
+    return f"{'+' * (share > 0)}{rough(100 * share)}%"
 
 
 def _colour(carrier: Carrier, end: Steepest) -> str:

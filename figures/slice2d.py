@@ -51,7 +51,8 @@ def draw(record: Record) -> Figure:
             above, below = figure.subfigures(2, 1, height_ratios=[1.25, 1], squeeze=False)[:, 0]
             axes = below.subplots()
             if (filled := _draw_plane(axes, field)) is not None:
-                below.colorbar(filled, cax=axes.inset_axes((1.03, 0.0, 0.045, 1.0)), label=field.label)
+                place = axes.inset_axes((1.03, 0.0, 0.045, 1.0))
+                below.colorbar(filled, cax=place, label=field.label, ticks=MaxNLocator(ACROSS))
         first, second = above.subplots(1, 2, sharey=True)
         _draw_section(first, field.x, field, axis=0)
         _draw_section(second, field.y, field, axis=1)
@@ -131,7 +132,7 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
 def _legend(field: Plane) -> list[Line2D]:
     label, marker = "loss, true renders", ""
     if not field.evaluated.all():
-        size = "unbounded" if field.error is None else f"<{100 * field.error:.2g}%"
+        size = "unbounded" if field.error is None else f"<{rough(100 * field.error)}%"
         label = f"loss; plane: {field.evaluated.mean():.0%} rendered,\nelse interpolated (error {size})"
         label, marker = "loss, renders" if field.unresolved else label, "."
     handles = [Line2D([], [], color=BLACK, marker=marker, markersize=4, label=label)]

@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 
 from analysis.console.failures import program
-from analysis.records.quantities import measured, power_of_ten
+from analysis.records.quantities import measured, percent, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from figures.density import draw_on
 from figures.scripts import script
@@ -66,7 +66,7 @@ def _finding(nodes: np.ndarray, weights: np.ndarray) -> str:
     '75% of the directions have less than 1%\\nof the largest curvature'
     """
     flat = float((weights * (np.abs(nodes) < FLAT * np.abs(nodes).max())).sum() / weights.sum())
-    words = f"{100 * flat:.3g}%" if flat < 0.9995 else "Over 99.9%"
+    words = percent(flat) if flat < 0.9995 else "Over 99.9%"
     return f"{words} of the directions have less than {FLAT:.0%}\nof the largest curvature"
 
 

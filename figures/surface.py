@@ -24,7 +24,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.console.drawing import own_python
 from analysis.console.failures import program
-from analysis.records.quantities import quantity
+from analysis.records.quantities import quantity, rough
 from analysis.records.records import Record
 from figures.eye import eye_over
 from figures.plane import Direction, Plane, plane
@@ -84,7 +84,7 @@ def _true_scale(field: Plane) -> str:
     ratio = across / along if along > 0 else 1.0
     if abs(ratio - 1) < SAME:
         return f"steps along {field.x.name} and {field.y.name} are drawn to one scale"
-    return f"a step along {field.y.name} is drawn {ratio:.2g} times as long as one along {field.x.name}"
+    return f"a step along {field.y.name} is drawn {rough(ratio)} times as long as one along {field.x.name}"
 
 
 def _heights(field: Plane) -> tuple[np.ndarray, np.ndarray]:

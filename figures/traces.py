@@ -21,7 +21,7 @@ from msgspec import structs
 
 from analysis.console.failures import program
 from analysis.records.findings import attribute_name, largest_steps, shares_per_trace
-from analysis.records.quantities import measured, power_of_ten
+from analysis.records.quantities import measured, power_of_ten, rough
 from analysis.records.records import ProbeRecord, Record
 from analysis.records.schema import Trace
 from figures.scripts import script
@@ -70,7 +70,7 @@ def _title(data: ProbeRecord) -> str:
     if (found := largest_steps(data)) is None:
         return "No attribute is the steepest for certain"
     first, second, ratio = found
-    text = f"Per step, {attribute_name(first)} is steepest: {ratio:.2g} × {attribute_name(second)}"
+    text = f"Per step, {attribute_name(first)} is steepest: {rough(ratio)} × {attribute_name(second)}"
     return f"{text}\n(beside the names: traces, each in its own unit)"
 
 

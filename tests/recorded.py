@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,12 @@ ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 def soft(text: str) -> str:
     """Text with spaces within its numbers that are as those between words."""
     return text.replace(HARD, " ")
+
+
+def long_numbers(text: str) -> list[str]:
+    """Numbers of more than three digits, leading zeros not counted; of whole ones, those without the separators of counts."""
+    found = re.findall(r"(?<![\w.,×])(?:\d[\d,]*\.\d+|\d{5,})(?![\w.]*\.\d)", text)
+    return [each for each in found if len(re.sub(r"[.,]", "", each).lstrip("0")) > 3]
 
 
 def probe_of(data: dict[str, Any]) -> ProbeRecord:

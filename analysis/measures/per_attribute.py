@@ -28,6 +28,7 @@ from analysis.measures.memory import basis_within, vectors_within
 from analysis.measures.split_control import SplitControl, split_control
 from analysis.measures.units import Metric, optimiser_units, scene_size, scene_units
 from analysis.records import schema
+from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord
 from landscape import BlockAnisotropy, BlockAnisotropySettings, Bracket, ScaledOperator, block_anisotropies
 from landscape.eigen.pairs import EigenEnds
@@ -215,14 +216,17 @@ def _metric(
         return "the stored parameters as they are", lambda _: None
     if metric == "scene":
         size = scene_size(objective)
-        return f"positions in units of the scene's size, {size:.4g} world units", lambda scene: scene_units(scene, size)
+        return f"positions in units of the scene's size, {quantity(size)} world units", lambda scene: scene_units(
+            scene, size
+        )
     rates, extent = training.config.rates, training.extent
+    positions = f"{quantity(rates.position * extent)} (extent {quantity(extent)})"
     if not (optimiser_units(objective, rates, extent) > 0).all():
         raise InputError(f"expected learning rates above 0 for the optimiser's metric, got {rates}")
     words = (
-        f"steps of the training's first learning rates: position {rates.position * extent:.3g} (extent {extent:.4g}), "
-        f"log scale {rates.log_scales:.3g}, rotation {rates.quats:.3g}, opacity {rates.opacity_logits:.3g}, "
-        f"colour {rates.sh_constant:.3g} and {rates.sh_higher:.3g}"
+        f"steps of the training's first learning rates: position {positions}, "
+        f"log scale {rates.log_scales:g}, rotation {rates.quats:g}, opacity {rates.opacity_logits:g}, "
+        f"colour {rates.sh_constant:g} and {rates.sh_higher:g}"
     )
     return words, lambda scene: optimiser_units(scene, rates, extent)
 

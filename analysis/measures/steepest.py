@@ -29,7 +29,7 @@ from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
 from analysis.measures.localization import mass_shares, masses, participation
-from analysis.records.quantities import Shade, percent, quantity, ratio
+from analysis.records.quantities import Shade, percent, quantity, ratio, rough
 from analysis.records.run_files import Carrier, Steepest
 from analysis.records.schema import Carries
 from landscape import curvature_reach
@@ -177,7 +177,7 @@ def shown_step(factors: Sequence[float]) -> int:
 def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Sequence[float]) -> str:
     """Sentence that compares renders with the curvature, at the step shown and over all steps, which descend."""
     best = shown_step(factors)
-    step, factor, alone = steps[best], factors[best], end.curvature * steps[best] ** 2 / 2 / loss
+    step, factor, alone = steps[best], factors[best], 50 * end.curvature * steps[best] ** 2 / loss
     extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])} stored units"
     ways = ("lower", "raise") if end.curvature < 0 else ("raise", "lower")
     if not factor > 0:
@@ -186,8 +186,10 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
             f"The {kind} along {end.name} is not confirmed by renders: {extent} {ways[1]} the loss, back and forth together, "
             f"where by the curvature they would {ways[0]} it."
         )
-    text = f"A step of {quantity(step)} stored units along {end.name} {ways[0]}s the loss by {abs(factor * alone):.2%}"
-    text += f", the mean of back and forth (by its curvature alone: {abs(alone):.2%})"
+    text = (
+        f"A step of {quantity(step)} stored units along {end.name} {ways[0]}s the loss by {rough(abs(factor * alone))}%"
+    )
+    text += f", the mean of back and forth (by its curvature alone: {rough(abs(alone))}%)"
     if abs(factor - 1) > AGREES:
         text += f", {quantity(factor)} times as much as the curvature has it"
     if max(abs(each - 1) for each in factors) <= AGREES:

@@ -15,6 +15,7 @@ from analysis.probe.measured import LeftOut, Measured, PlaneSlice
 from analysis.probe.settings import TEN
 from analysis.records import schema
 from analysis.records.provenance import Provenance
+from analysis.records.quantities import quantity
 from analysis.records.records import Check, Counts, ProbeRecord, Skip, counts_of, objective_of
 from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, eigenvalue_ratio
@@ -222,8 +223,9 @@ def finite_record(probe: FiniteProbe) -> schema.FiniteProbe:
 
 
 def slice_record(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
-    x, y = (float(axis.abs().max()) for axis in plane.slice.coordinates)
-    units = [reach / unit for reach, unit in zip((x, y), plane.units, strict=True)]
+    reaches = [float(axis.abs().max()) for axis in plane.slice.coordinates]
+    units = [reach / unit for reach, unit in zip(reaches, plane.units, strict=True)]
+    x, y = map(quantity, reaches)
     numbers = zip(NAMES, pairs.values.tolist(), pairs.residuals.tolist(), plane.units, strict=False)
     return schema.Slice(
         directions=[
@@ -232,7 +234,7 @@ def slice_record(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
         ],
         loss_scale=plane.loss_scale,
         **plane.slice.record(),  # pyright: ignore[reportArgumentType]
-        note=f"±{units[0]:.3g} curvature units each way: ±{x:.3g} along e₁ and ±{y:.3g} along e₂, stored units",
+        note=f"±{quantity(units[0])} curvature units each way: ±{x} along e₁ and ±{y} along e₂, stored units",
     )
 
 

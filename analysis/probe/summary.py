@@ -143,7 +143,7 @@ def _step(data: ProbeRecord) -> str:
     parts = [SHORT.get(name, name) for name in ranked]
     joined = [", then " if change(before, 0) > change(name, 1) else " ≈ " for before, name in pairwise(ranked)]
     if first := largest_steps(data):
-        text = f"of the optimiser in {parts[0]} changes the loss {first[2]:.2g} times as much as in {parts[1]}"
+        text = f"of the optimiser in {parts[0]} changes the loss {rough(first[2])} times as much as in {parts[1]}"
         return text + "".join(map("".join, zip(joined[1:], parts[2:], strict=True)))
     return f"of the optimiser changes the loss most in {parts[0]}" + "".join(
         map("".join, zip(joined, parts[1:], strict=True))

@@ -13,7 +13,7 @@ from msgspec import UNSET
 
 from analysis.records import schema
 from analysis.records.provenance import Provenance
-from analysis.records.quantities import UNDETERMINED, limits, measured, quantity, solved
+from analysis.records.quantities import UNDETERMINED, measured, quantity, rough, solved
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
 
 ATTRIBUTES = {
@@ -138,7 +138,7 @@ def largest_steps(data: ProbeRecord) -> tuple[str, str, float] | None:
 def _of_largest_step(first: str, second: str, ratio: float) -> Line:
     return Line(
         f"By its curvature a random step in {attribute_name(first)}, as long as the optimiser's first, changes the loss "
-        f"{ratio:.2g} times as much as one in {attribute_name(second)}, the next."
+        f"{rough(ratio)} times as much as one in {attribute_name(second)}, the next."
     )
 
 
@@ -206,8 +206,8 @@ def _of_anisotropy(data: ProbeRecord) -> list[Line]:
         text = f"The ratio of the two ends of the spectrum is not determined{_in_brackets(ratio.note)}."
         lines.append(Line(text, "caution"))
     if share and _is_finite(share.value) and not is_loose(share):
-        text = f"The steepest direction alone holds {share.value:.2%} of all absolute curvature"
-        lines.append(Line(f"{text}{_bracket(share, '{:.2%}'.format)}."))
+        text = f"The steepest direction alone holds {_percent(share.value)} of all absolute curvature"
+        lines.append(Line(f"{text}{_bracket(share, _percent)}."))
     return lines
 
 
@@ -337,7 +337,7 @@ def _of_skips(skipped: Mapping[str, Skip]) -> list[Line]:
     parts = []
     for name, skip in sorted(skipped.items(), key=lambda item: -(item[1].seconds_saved or 0.0)):
         if skip.count:
-            saved = "" if skip.seconds_saved is None else f" ({skip.seconds_saved:.1f} s)"
+            saved = "" if skip.seconds_saved is None else f" ({rough(skip.seconds_saved)} s)"
             parts.append(f"{skip.count:,} {name.replace('_', ' ').replace('gaussian', 'Gaussian')}{saved}")
     return [Line(f"Left out, with the time it saved where that is known: {', '.join(parts)}.")] if parts else []
 
@@ -377,9 +377,9 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
 def _errors_of_interpolation(plane: schema.Slice) -> str:
     bound, count = plane.interpolation_error, plane.holdout_points
     seen = bound if plane.error_seen in (None, UNSET) else plane.error_seen
-    size = "without bound" if seen is None else f"at most {100 * seen:.2g}%"
+    size = "without bound" if seen is None else f"at most {_percent(seen)}"
     text = f"the error at {count} random point{'' if count == 1 else 's'}: {size}"
-    return text if bound is None else f"{text}; the bound for all: {100 * bound:.2g}%"
+    return text if bound is None else f"{text}; the bound for all: {_percent(bound)}"
 
 
 def unresolved(plane: schema.Slice, made: Provenance) -> str:
@@ -393,7 +393,7 @@ def unresolved(plane: schema.Slice, made: Provenance) -> str:
 
 
 def _to_tolerance(plane: schema.Slice) -> str:
-    return f" to {100 * plane.tolerance:.2g}% of the range of the loss" if plane.tolerance else ""
+    return f" to {_percent(plane.tolerance)} of the range of the loss" if plane.tolerance else ""
 
 
 def _sentence(note: str) -> str:
@@ -405,13 +405,17 @@ def _is_finite(number: schema.Number) -> TypeGuard[float]:
 
 
 def _bracket(index: schema.Index, written: Callable[[float], str] | None = None) -> str:
-    """Its bracket in words.  written: formats an end; by default `limits` formats both."""
+    """Its bracket in words; none where its ends look alike.  written: formats an end."""
     ends = index.low, index.high
-    texts = limits(*ends) if written is None else [UNDETERMINED if end is None else written(end) for end in ends]
+    texts = [UNDETERMINED if end is None else (written or quantity)(end) for end in ends]
     if None not in ends:
-        return f" (between {texts[0]} and {texts[1]})"
+        return f" (between {texts[0]} and {texts[1]})" if texts[0] != texts[1] else ""
     known = [f" (at {words} {text})" for words, end, text in zip(("least", "most"), ends, texts, strict=True) if end]
     return known[0] if known else ""
+
+
+def _percent(share: float) -> str:
+    return f"{rough(100 * share)}%"
 
 
 def _in_brackets(note: schema.Maybe[str]) -> str:

@@ -1,8 +1,8 @@
 """Numbers as text, with their errors: `(1.23 ± 0.04) × 10⁵`; and as colours: `Shade`.
 
-The error is rounded to two significant digits and the value to the same place; without an error a number has three
-significant digits.  None, *not determined* in a record, is an en dash.  The spaces within a number are HARD, so that it is
-not broken over lines.
+A number that a person reads has three significant digits at most; its error, of two at most, ends at the same place, or is
+left out where these digits do not show it.  Records keep all digits.  None, *not determined* in a record, is an en dash.  The
+spaces within a number are HARD, so that it is not broken over lines.
 """
 
 import math
@@ -18,7 +18,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
 HARD = "\N{NO-BREAK SPACE}"
 PLUS_MINUS, TIMES = f"{HARD}±{HARD}", f"{HARD}×{HARD}"
-FINEST = 10  # significant digits
+DIGITS = 3  # significant
 BYTES, NOTHING = 254, 255  # of a scale in bytes: its upper end, and the code of no value
 GREY = 128  # the colour of no value, in bytes
 SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}  # of metrics.json
@@ -30,18 +30,22 @@ def quantity(value: float | None, error: float | None = None) -> str:
 
     >>> texts = quantity(123456.0, 4321.0), quantity(-0.0123), quantity(3e-12, 1e-11), quantity(None)
     >>> [text.replace(HARD, " ") for text in texts]
-    ['(1.235 ± 0.043) × 10⁵', '−0.0123', '(0.3 ± 1.0) × 10⁻¹¹', '–']
+    ['(1.23 ± 0.04) × 10⁵', '−0.0123', '(0.3 ± 1.0) × 10⁻¹¹', '–']
+    >>> quantity(105.598, 0.00035), quantity(20.0, 1.23).replace(HARD, " "), quantity(2.0, 0.004)
+    ('106', '20.0 ± 1.2', '2.00')
     """
     if value is None:
         return UNDETERMINED
     if not math.isfinite(value):
         return "not a number" if math.isnan(value) else "−∞" if value < 0 else "∞"
-    if error is None or not math.isfinite(error) or error <= 0:
-        return _plain(value) if error is None or error == 0 else f"{_plain(value)}{PLUS_MINUS}?"
-    if error < 1e-9 * abs(value):
-        return f"{_plain(value, FINEST)}{PLUS_MINUS}{_plain(error, 2)}"
+    if error is None or error == 0:
+        return _plain(value)
+    if not 0 < error < math.inf:
+        return f"{_plain(value)}{PLUS_MINUS}?"
     exponent = _exponent(max(abs(value), error))
-    places = 1 - _exponent(error)
+    places = min(1 - _exponent(error), DIGITS - 1 - exponent)
+    if Decimal(error).scaleb(places) < Decimal("0.5"):
+        return _plain(value)
     if -3 <= exponent <= 3:
         return f"{_fixed(value, 0, places)}{PLUS_MINUS}{_fixed(error, 0, places)}"
     places += exponent
@@ -109,20 +113,13 @@ def ratio(aspect: float) -> str:
     return f"{aspect:.{0 if aspect > 10 else 1}f} : 1"
 
 
-def limits(low: float | None, high: float | None) -> tuple[str, str]:
-    """Both ends of an interval, to three significant digits or to as many as tell them apart.
+def limits(low: float | None, high: float | None, between: str = " … ") -> str:
+    """Both ends of an interval; one number where both look alike.
 
-    >>> limits(0.17504, 0.17531), limits(None, 2.0), limits(1.0, 1.0)
-    (('0.1750', '0.1753'), ('–', '2.00'), ('1.00', '1.00'))
+    >>> limits(0.17504, 0.17531), limits(None, 2.0), limits(1.0, 3.0, " to ")
+    ('0.175', '– … 2.00', '1.00 to 3.00')
     """
-    texts = quantity(low), quantity(high)
-    if low is None or high is None or low == high:
-        return texts
-    for digits in range(4, FINEST + 1):
-        if texts[0] != texts[1]:
-            break
-        texts = _plain(low, digits), _plain(high, digits)
-    return texts
+    return between.join(dict.fromkeys((quantity(low), quantity(high))))
 
 
 def power_of_ten(exponent: int) -> str:
@@ -156,7 +153,7 @@ def unit_suffix(exponent: int) -> str:
     return f" (×{power_of_ten(exponent)})" if exponent else ""
 
 
-def _plain(value: float, digits: int = 3) -> str:
+def _plain(value: float, digits: int = DIGITS) -> str:
     """`value` with this many significant digits."""
     exponent = _exponent(value)
     if value == 0:

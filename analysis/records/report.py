@@ -33,7 +33,7 @@ from analysis.records.findings import (
 )
 from analysis.records.json_files import plain
 from analysis.records.provenance import Provenance
-from analysis.records.quantities import exponent_of, limits, measured, percent, quantity, ratio, unit_suffix
+from analysis.records.quantities import exponent_of, limits, measured, percent, quantity, ratio, rough, unit_suffix
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map, read_maps
 from analysis.records.schema import INDICES
@@ -229,7 +229,7 @@ def _steepest_attribute(data: ProbeRecord) -> list[dict[str, str]]:
     if steps := largest_steps(data):
         first, second, ratio = attribute_name(steps[0]), attribute_name(steps[1]), steps[2]
         words = f"the change of the loss by a step of the optimiser: {first} over {second}"
-        return [{"value": f"{ratio:.2g} : 1", "words": words}]
+        return [{"value": f"{rough(ratio)} : 1", "words": words}]
     if not (values := trace_values(data)):
         return []
     name = max(values, key=lambda each: abs(values[each]))

@@ -234,7 +234,7 @@ def bracketed(index: Index | None) -> Cell:
     >>> bracketed(Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")).value
     '≥ 34.2'
     >>> print(bracketed(Index(value=2.0, low=1.95, high=2.04, note="")).value.replace(HARD, " "))
-    2.000 ± 0.050
+    2.00 ± 0.05
     >>> bracketed(Index(value=2.0, low=1.0, high=30.0, note=""))
     Cell(value='–', bracket='1.00 … 30.0', note='')
     """
@@ -247,7 +247,7 @@ def bracketed(index: Index | None) -> Cell:
         return Cell(f"≥ {quantity(low)}" if high is None else f"≤ {quantity(high)}", "", note)
     if value is not None and low <= value <= high and high - low < NARROW * abs(value):
         return Cell(measured(value, max(high - value, value - low)), "", note)
-    return Cell(UNDETERMINED if is_wide(index) else quantity(value), " … ".join(limits(low, high)), note)
+    return Cell(UNDETERMINED if is_wide(index) else quantity(value), limits(low, high), note)
 
 
 def factor(effect: Effect | None) -> Cell:

@@ -20,7 +20,7 @@ from figures.plane import plane
 from figures.render_surface import Box
 from figures.style import BLACK, COLUMN, save, style
 from landscape.errors import TooLittleMemory
-from tests.recorded import synthetic, written
+from tests.recorded import long_numbers, synthetic, written
 from tests.refusals import refused
 
 POINT = 1 / 72  # inches
@@ -45,11 +45,16 @@ def nothing_drawn(*_):
 
 
 def laid_out(figure, dpi=100):
-    """The figure drawn once, as `save` does, at a resolution that suffices for its layout; the renderer that measures it."""
+    """The figure drawn once, as `save` does, at a resolution that suffices for its layout; the renderer that measures it.
+
+    None of its texts has a number of more than three digits.
+    """
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     with style():  # how many ticks there are is decided when they are drawn
         canvas.draw()
+    texts = [text.get_text() for text in figure.findobj(Text) if text.get_visible()]
+    assert [text for text in texts if long_numbers(text)] == []
     return canvas.get_renderer()
 
 
@@ -60,7 +65,7 @@ def words(figure, renderer):
 
 
 def require_layout(figure):
-    """Everything drawn lies inside the figure, of a column's width, and no two texts overlap."""
+    """Everything drawn lies inside the figure, of a column's width; no two texts overlap."""
     renderer = laid_out(figure)
     drawn = figure.get_tightbbox(renderer)
     assert figure.get_figwidth() == COLUMN
@@ -196,7 +201,7 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     }
     assert dots == {slice2d.FAINT["color"]: 5 * 5}
     said = " ".join(text for text, _ in words(figure, laid_out(figure)))
-    assert "plane: 7% rendered,\nelse interpolated (error <0.4%)" in said and "order changed:\n10 of 25" in said
+    assert "plane: 7% rendered,\nelse interpolated (error <0.40%)" in said and "order changed:\n10 of 25" in said
     sections = [axes for axes in figure.axes if "step along" in axes.get_xlabel()]
     along = [[len(np.asarray(x.get_xdata())) for x in axes.lines if x.get_marker() == "."] for axes in sections]
     assert [3, 2] in along  # the crossed ones apart

@@ -30,6 +30,7 @@ from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance_of
+from analysis.records.quantities import quantity
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
@@ -165,8 +166,8 @@ def _conclude(table: pd.DataFrame, options: NextViewOptions, out: Path) -> None:
     for title in ("view", *columns, "behind", "pick"):
         shown.add_column(title, justify="left" if title == "view" else "right")
     for row in table.reset_index().to_dict("records"):
-        pick, behind = f"{row['pick']:.0f}" if row["pick"] > 0 else "", f"{row['behind']:.2g} ± {row['error']:.1g}"
-        shown.add_row(row["view"], *(f"{row[name]:.3g}" for name in columns), behind, pick)
+        pick, behind = f"{row['pick']:.0f}" if row["pick"] > 0 else "", quantity(row["behind"], row["error"])
+        shown.add_row(row["view"], *(quantity(row[name]) for name in columns), behind, pick)
     console.print(shown)
     names, equal = ", ".join(table.index[table.pick.notna()]), [*table.index[table.behind <= TWICE * table.error]]
     say(f"next, by {options.by}: {names}", console=console)

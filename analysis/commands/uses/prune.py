@@ -33,6 +33,7 @@ from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance_of
+from analysis.records.quantities import quantity
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
@@ -234,13 +235,15 @@ def _conclude(
         table.add_column(title, justify="left" if title == "score" else "right")
     losses = [lost(curve, *at, measure) for at in columns] if curve is not None else []
     for name in SCORES:
-        table.add_row(name, f"{ranks.loc[TRUTH, name]:.3f}", *(f"{loss[name]:.2f} dB" for loss in losses))
+        table.add_row(name, quantity(ranks.loc[TRUTH, name]), *(f"{loss[name]:.2f} dB" for loss in losses))
     Console().print(table)
     for (removed, steps), loss in zip(columns, losses, strict=True):
         best = min(EXACT, key=lambda name, of=loss: of[name])
         found = f"{best} loses {loss[best]:.2f} dB, opacity {loss['opacity']:.2f} dB"
         limit = f"; undecided, because those {steps} steps have one seed" if steps else ", of this one training"
         say(f"{removed:.0%} removed, {steps} steps after: {found}{limit}")
-    scored = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in result.items() if np.isfinite(value))
+    scored = ", ".join(
+        f"{name.replace('_', ' ')} {quantity(value)}" for name, value in result.items() if np.isfinite(value)
+    )
     say(f"kept {len(gaussians):,} Gaussians: {scored}")
     say(f"checkpoint.pt, pruned.ply, scores.csv, correlations.csv{', curve.png' if columns else ''} in {out}")

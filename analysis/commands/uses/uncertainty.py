@@ -26,6 +26,7 @@ from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance_of
+from analysis.records.quantities import quantity
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError
 from splat.curvature.linearize import LinearizedView
@@ -86,7 +87,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         "a variance leaves out what couples the Gaussians (diagonal: also their parameters), and has no unit of the error",
         f"means over {len(held_out)} held-out views; agreement.csv, view-*.png in {out}",
     )
-    say(means.round(3).to_string(), *words, *notes, *checkpoint.assumptions)
+    say(means.to_string(float_format=quantity), *words, *notes, *checkpoint.assumptions)
     return 0
 
 

@@ -230,7 +230,7 @@ def test_the_record_and_the_page_hold_every_family_and_what_the_split_does(recor
     lines = page.rows("per_attribute")
     assert len(lines) == 1 + 3 * 12 and all(len(line) == len(lines[0]) == 7 + len(INDICES) for line in lines)
     assert sum("×" in line[7 + 2] for line in lines if line[2] == "changes by") == 12  # the share
-    assert split.unit in page.text
+    assert soft(split.unit) in page.text
 
 
 def test_a_family_whose_small_end_is_not_resolved_is_given_by_its_bound(record):
@@ -266,7 +266,7 @@ def test_an_end_that_was_not_reached_says_so_with_its_bound(record):
 
 def test_at_80_columns_every_number_and_label_is_whole(record):
     data = copy.deepcopy(record.data)
-    wide = Index(value=-1.234e-4, low=-1.235e-4, high=-1.233e-4, note="")
+    wide = Index(value=-1.234e-4, low=-1.274e-4, high=-1.194e-4, note="")
     bracket = Index(value=8.25e-4, low=7.45e-4, high=1.02e4, note="")
     for row in data.per_attribute:
         row.indices.eigenvalue_ratio, row.indices.top_mass, row.indices.participation_ratio = wide, bracket, bracket
@@ -281,7 +281,7 @@ def test_at_80_columns_every_number_and_label_is_whole(record):
     said = soft("\n".join(lines))
     for whole in ("Gauss-Newton", "colour (SH)", "  changes by", "participation ratio"):
         assert whole in said
-    assert said.count("± 0.0010) × 10⁻⁴") == 36 and said.count("7.45 × 10⁻⁴ …") == said.count("1.02 × 10⁴") >= 72
+    assert said.count("± 0.04) × 10⁻⁴") == 36 and said.count("7.45 × 10⁻⁴ …") == said.count("1.02 × 10⁴") >= 72
     assert not re.search(r"\S…", said)  # where text was cut off
 
 

@@ -80,17 +80,17 @@ TOGETHER = "back and forth together, where by the curvature"
 @pytest.mark.parametrize(
     ("curvature", "factors", "said"),
     [
-        (4.0, [1.1, 1.0, 0.9], f"A step of 0.200 stored units along e raises the loss by 4.40%, {MEAN} 4.00%)."),
+        (4.0, [1.1, 1.0, 0.9], f"A step of 0.200 stored units along e raises the loss by 4.4%, {MEAN} 4.0%)."),
         (
             4.0,
             [3.0, 0.9, 1.0],
-            f"{STEP} raises the loss by 0.90%, {MEAN} 1.00%); over {RANGE} by 0.900 to 3.00 times what ",
+            f"{STEP} raises the loss by 0.90%, {MEAN} 1.0%); over {RANGE} by 0.900 to 3.00 times what ",
         ),
-        (-4.0, [-1.0, 1.1, 1.0], f"{STEP} lowers the loss by 1.10%, "),
+        (-4.0, [-1.0, 1.1, 1.0], f"{STEP} lowers the loss by 1.1%, "),
         (
             -4.0,
             [-1.0, 0.5, 0.6],
-            f"{STEP} lowers the loss by 0.50%, {MEAN} 1.00%), 0.500 times as much as the curvature has",
+            f"{STEP} lowers the loss by 0.50%, {MEAN} 1.0%), 0.500 times as much as the curvature has",
         ),
         (-4.0, [-0.2, -1.4, -1.9], f"The negative curvature {REFUTED} raise the loss, {TOGETHER} they would lower it."),
         (4.0, [-0.2, -1.4, -1.9], f"The curvature {REFUTED} lower the loss, "),

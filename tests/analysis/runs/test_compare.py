@@ -13,7 +13,7 @@ from analysis.commands.cli import main
 from analysis.probe.command import asked
 from analysis.records.json_files import plain
 from analysis.records.provenance import provenance_of
-from analysis.records.quantities import measured, quantity
+from analysis.records.quantities import SCORES, measured, quantity
 from analysis.records.schema import Index
 from analysis.records.tables import bracketed
 from analysis.runs import compared
@@ -28,7 +28,7 @@ from splat.training.checkpoint import load_checkpoint, open_subject, save_checkp
 from splat.training.methods.sam import SAM
 from splat.training.origin.fingerprint import FORMULAS
 from tests.figures.test_trajectory_figure import rows
-from tests.recorded import depth_section, own, synthetic, written
+from tests.recorded import depth_section, long_numbers, own, synthetic, written
 
 ITERATIONS = 4
 SETTINGS = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
@@ -146,6 +146,10 @@ def test_the_file_holds_the_numbers_of_the_records_and_metrics(trained, tmp_path
 def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(trained, tmp_path, capsys, no_pictures):
     assert main(["compare", str(trained / "plain/0"), str(trained / "sam/0"), "--out", str(tmp_path)]) == 0
     said, page = capsys.readouterr().out, (tmp_path / "compare.html").read_text()
+    lines = [
+        line for line in said.splitlines() if not any(name in line for name in SCORES.values())
+    ]  # of their own places
+    assert len(lines) > 20 and long_numbers("\n".join(lines)) == []
     assert "http" not in page.replace("http-equiv", "") and "<script" not in page
     assert "which hardly changes the image" in page
     for scale in (1.0, 0.5):
