@@ -115,7 +115,7 @@ def read_spz(content: bytes) -> SplatFile:
         alpha = np.frombuffer(whole, np.uint8, n, SPZ_HEADER.size + 9 * n)
         clamped = int(((alpha == 0) | (alpha == 255)).sum())
     found = _from_gsply("read_spz", content, f".spz version {version}", clamped, antialiased=bool(flags & 1))
-    return replace(found, gaussians=_turned(found.gaussians), other_axes=found.gaussians)
+    return replace(found, gaussians=turned(found.gaussians), other_axes=found.gaussians)
 
 
 def _inflated(content: bytes, size: int) -> bytes:
@@ -126,7 +126,7 @@ def _inflated(content: bytes, size: int) -> bytes:
         raise InputError(f"its compressed bytes are damaged ({error})") from error
 
 
-def _turned(found: Gaussians) -> Gaussians:
+def turned(found: Gaussians) -> Gaussians:
     """The same with its axes y and z turned round, from .spz's right, up, back to a PLY's right, down, front."""
     gaussians = found.with_flat(found.flat.clone())
     attributes = gaussians.attributes

@@ -6,11 +6,12 @@ picture, frame, images or conventions are wrong, and so would be all numbers.
 """
 
 import re
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
+from functools import partial
 from math import ceil
 from pathlib import Path
-from statistics import fmean
 from typing import Any, Literal
 
 import numpy as np
@@ -23,23 +24,19 @@ from splat.model.files.splat_file import SplatFile
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.model.untrusted import loose_json
-from splat.render.render import render
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, explicit_split, read_names, split_scene
-from splat.scenes.view import View
-from splat.scenes.write import bytes_of, png
 from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_frame, posed, shift_of, shift_to_origin
+from splat.training.origin.likeness import Photographs, Reading, mistaken
 from splat.training.origin.options import Foreign
-from splat.training.origin.presets import PRESETS, Preset, preset_of, render_of
+from splat.training.origin.presets import PRESETS, Preset, World, preset_of, render_of
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig, Training
 
-LEAST_PSNR = 15.0  # dB; scenes that are trained at all have more on their training views
-MARGIN = (
-    3.0  # dB above pictures of one colour, which have 9.5 to 19.5 in twelve public scenes: half of their error is gone
-)
 TURNED_BACK = "its y and z axes are those of a PLY, not of its format, as the photographs show"
 GUARDED = 2  # views
+# A preset of each kind of world
+WORLDS: dict[World, str] = {"scene": "gsplat-raw", "gsplat": "gsplat", "nerfstudio": "nerfstudio"}
 NERFSTUDIO_SHARE = 0.9
 LOSSY = "curvature of the quantised scene: the file has rounded the trained numbers"
 WHITE = (1.0, 1.0, 1.0)
@@ -66,21 +63,19 @@ def foreign_training(
     split, how = _split(scene, found, ask, path, train)
     reference = SceneReference.to(scene, path, split, images, downscale)
     config = _config(scene, found, preset.loss, render, ask)
-    poses = [
-        Pose(_near(gaussians, world) if preset.world == "scene" else gaussians, world, note)
-        for gaussians, note in ((found.gaussians, ()), (found.other_axes, (TURNED_BACK,)))
-        if gaussians is not None
-        for world in _worlds(preset, scene, path)
-    ]
-    pose, level = _best(poses, scene, reference, config, picture, name)
-    similarity = pose.similarity
+    names = [split.train[i * len(split.train) // GUARDED] for i in range(min(GUARDED, len(split.train)))]
+    photographs = Photographs(scene, names, config, centred=preset.centred)
+    found_in = partial(_readings, found, scene, path)
+    reading = photographs.best(found_in(preset.world), lambda best: _mistaken(best, preset.world, found_in))
+    level = photographs.require(reading, lambda image: _suspicion(image, config, name), picture)
+    similarity = reading.similarity
     reference = replace(reference, similarity=similarity, centred=preset.centred)
     moved = posed(scene, similarity, centred=preset.centred)
-    training = Training.start(pose.gaussians, moved.extent(split.train), config)
+    training = Training.start(reading.gaussians, moved.extent(split.train), config)
     training.step = found.step or 0
     notes = [
         *found.notes,
-        *pose.notes,
+        *reading.notes,
         *preset.different,
         *_left_out(found, config.loss),
         *([LOSSY] if found.lossy else []),
@@ -211,10 +206,25 @@ def _left_out(found: SplatFile, loss: LossSettings) -> list[str]:
     return lines
 
 
-def _worlds(preset: Preset, scene: Scene, path: Path) -> Sequence[Similarity | None]:
-    if preset.world == "gsplat":
-        return gsplat_frames(scene)
-    return [nerfstudio_frame(path, scene) if preset.world == "nerfstudio" else shift_to_origin(scene)]
+def _readings(found: SplatFile, scene: Scene, path: Path, kind: World) -> Iterator[Reading]:
+    """All that the file may mean in a kind of world.  InputError where the scene has not that."""
+    if kind == "gsplat":
+        worlds: Sequence[Similarity | None] = gsplat_frames(scene)
+    else:
+        worlds = [nerfstudio_frame(path, scene) if kind == "nerfstudio" else shift_to_origin(scene)]
+    for gaussians, notes in ((found.gaussians, ()), (found.other_axes, (TURNED_BACK,))):
+        for world in worlds if gaussians is not None else ():
+            yield Reading(_near(gaussians, world) if kind == "scene" else gaussians, world, notes)
+
+
+def _mistaken(best: Reading, kind: World, found_in: Callable[[World], Iterator[Reading]]) -> Iterator[Reading]:
+    """What another writer, or one with another world than that of this kind, would have meant."""
+    yield from mistaken(best)
+    for other, name in WORLDS.items():
+        with suppress(InputError):  # the scene has no such world
+            for each in found_in(other) if other != kind else ():
+                fault = f"the world of {WORLDS[kind]}, got that of {name}"
+                yield replace(each, fault=fault, remedy=f"take --trained-by {name}")
 
 
 def _near(gaussians: Gaussians, world: Similarity | None) -> Gaussians:
@@ -229,71 +239,15 @@ def _near(gaussians: Gaussians, world: Similarity | None) -> Gaussians:
     return replace(gaussians, flat=Gaussians.pack(gaussians.attributes | {"means": means.to(gaussians.flat)}).flat)
 
 
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """Gaussians as they may have been meant, in a world that they may be in.  notes: what that says of the file."""
-
-    gaussians: Gaussians
-    world: Similarity | None
-    notes: tuple[str, ...]
-
-    @property
-    def similarity(self) -> list[list[float]] | None:
-        return None if self.world is None else self.world.tolist()
-
-
-def _best(
-    poses: Sequence[Pose], scene: Scene, reference: SceneReference, config: TrainConfig, picture: Path, name: str
-) -> tuple[Pose, float]:
-    """The pose in which the Gaussians look most like the photographs, and their PSNR there, dB.
-
-    Colours are compared as the loss does, not cut to [0, 1].  InputError below LEAST_PSNR, or below MARGIN above what pictures
-    of one colour have, each its photograph's mean: this is low where photographs have little contrast.
-    """
-    names = [reference.train[i * len(reference.train) // GUARDED] for i in range(min(GUARDED, len(reference.train)))]
-    tried = []
-    for pose in poses:
-        views = posed(scene, pose.similarity, centred=PRESETS[name].centred).load(names)
-        images = [_render(pose.gaussians, view, config) for view in views]
-        level = fmean(_likeness(image, view.image) for image, view in zip(images, views, strict=True))
-        tried.append((level, pose, images[0], views))
-    level, pose, image, views = max(tried, key=lambda each: each[0])
-    plain = fmean(_likeness(view.image.mean(dim=(1, 2), keepdim=True), view.image) for view in views)
-    if not level >= (least := max(LEAST_PSNR, plain + MARGIN)):
-        _save_side_by_side(image.clamp(0, 1), views[0], picture)
-        raise InputError(
-            f"expected Gaussians that look like the scene's photographs, got {level:.1f} dB on training views (at least "
-            f"{least:.1f}; pictures of one colour have {plain:.1f}); {_suspicion(image, config, name, len(poses))}; "
-            f"{picture} shows the render beside the photograph"
-        )
-    return pose, level
-
-
-def _likeness(image: torch.Tensor, photograph: torch.Tensor) -> float:
-    """PSNR, dB, of colours as they are: those beyond [0, 1] belong to the loss."""
-    return float(-10 * (image.double() - photograph).square().mean().log10())
-
-
-@torch.no_grad()
-def _render(gaussians: Gaussians, view: View, config: TrainConfig) -> torch.Tensor:
-    background = config.background_colour(gaussians.flat.dtype)
-    return render(gaussians, view.camera, background, config.render).image
-
-
-def _suspicion(image: torch.Tensor, config: TrainConfig, name: str, worlds: int) -> str:
+def _suspicion(image: torch.Tensor, config: TrainConfig, name: str) -> str:
     """Guess at what is wrong."""
     bare = (image - config.background_colour(image.dtype)[:, None, None]).abs().amax(dim=0) < 1 / 255
     if bare.float().mean() > 0.5:
         return (
             "is this their scene? else they are hardly in sight because their world is not that of "
-            f"{name}'s cameras ({worlds} tried); name another --trained-by, such as gsplat where the world was normalised"
+            f"{name}'s cameras; name another --trained-by, such as gsplat where the world was normalised"
         )
     return (
         "is this their scene? else it is other images (--images, --downscale), or another trainer (--trained-by), whose world "
         "or signs differ"
     )
-
-
-def _save_side_by_side(image: torch.Tensor, view: View, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(png(bytes_of(torch.cat([image, view.image], dim=2))))

@@ -25,7 +25,7 @@ from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, open_checkpoint, open_subject, save_checkpoint
 from splat.training.loop import train
-from splat.training.origin.foreign import LEAST_PSNR, MARGIN
+from splat.training.origin.likeness import LEAST_PSNR, MARGIN
 from splat.training.origin.options import Foreign
 from splat.training.origin.presets import PRESETS
 from splat.training.origin.scene_reference import SceneReference
@@ -41,7 +41,7 @@ MADE = synthetic_scene(SyntheticSettings(gaussians=60, views=12, width=24, heigh
 def gaussians() -> Gaussians:
     """The truth with colours of degree 3 that are a little off, so that the loss is not at 0."""
     g = MADE.truth.select(torch.arange(len(MADE.truth)), 3)
-    g.sh.add_(0.1 * torch.randn(g.sh.shape, generator=torch.Generator().manual_seed(0)))
+    g.sh.add_(0.03 * torch.randn(g.sh.shape, generator=torch.Generator().manual_seed(0)))
     return g
 
 
