@@ -19,7 +19,15 @@ from pathlib import Path
 from llvmlite.binding import get_host_cpu_features
 
 ROOT = Path(__file__).resolve().parents[1]
-KERNELS = ["tests/splat", "tests/analysis", "tests/test_notebooks.py", "splat", "analysis"]  # other layers import none
+KERNELS = [
+    "tests/splat",
+    "tests/analysis",
+    "tests/notebooks",
+    "tests/test_notebooks.py",
+    "splat",
+    "analysis",
+    "notebooks",
+]
 NEWEST = "x86-64-v4" if get_host_cpu_features().get("avx512f") else "x86-64-v3"
 LIBRARIES = {  # of torch, its MKL, and NumPy with its OpenBLAS
     "ATEN_CPU_CAPABILITY": "default",

@@ -197,7 +197,7 @@ def test_traces_of_sums_over_pixels_are_exact(loss: LossSettings, gauss_newton: 
     ids=["near a fit", "far from a fit", "in units", "Gauss-Newton", "Gauss-Newton, in units"],
 )
 def test_traces_with_ssim_are_within_their_errors_over_many_seeds(noise: float, gauss_newton: bool, scaled: bool):
-    objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise)
+    objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise, size=(24, 20))
     scale = units_of(objective) if scaled else None
     diagonal = dense(SceneHessian(objective, gauss_newton=gauss_newton)).diagonal()
     diagonal = diagonal if scale is None else diagonal * scale.square()
@@ -226,7 +226,7 @@ def samples_of(
 @pytest.mark.parametrize("noise", [0.02, 0.5], ids=["near a fit", "far from a fit"])
 def test_intervals_of_fixed_and_adaptive_budgets_cover_as_stated(noise: float) -> None:
     """95% intervals: 200 runs of 95% stay within 89.5 to 99% with a probability of 0.9986 (four blocks in a hundred fail)."""
-    objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise)
+    objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise, size=(24, 20))
     H, names = dense(SceneHessian(objective)), list(objective.blocks)
     truth = {name: float(H.diagonal()[rows].sum()) for name, rows in objective.blocks.items()}
     quats, generator = objective.active.quats, torch.Generator().manual_seed(0)

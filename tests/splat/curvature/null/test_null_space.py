@@ -28,7 +28,7 @@ LOSSES = [LossSettings(), LossSettings("l2"), LossSettings("charbonnier")]
 NULL = torch.finfo(torch.float64).eps  # of H's largest eigenvalue: rounding leaves less of a zero
 
 
-def objective_of(views: int, sh_degree: int, n: int = 14, mode: Antialias = "none") -> SceneObjective:
+def objective_of(views: int, sh_degree: int, n: int = 7, mode: Antialias = "none") -> SceneObjective:
     gaussians, generator = filtered(random_gaussians(n, sh_degree, seed=2), mode), torch.Generator().manual_seed(4)
     cameras = [random_camera(32, 28, seed=seed, focal=34.0) for seed in range(views)]
     pictures = [torch.rand(3, 28, 32, generator=generator) for _ in cameras]
