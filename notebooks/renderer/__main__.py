@@ -1,9 +1,9 @@
-"""The bridge to other people's renderers, measured on our own: `python -m notebooks.renderer [RUN ...] [--out TABLE.csv]`.
+"""The bridge to other people's renderers, measured where the truth is known: `python -m notebooks.renderer [RUN ...]`.
 
-A synthetic scene (`demo`) in float64 and float32, then each RUN, a folder of `landscape train`, in float32: the rasteriser
-gives images and their gradients, and the exact operators are the truth.  The table (columns: `notebooks.renderer.measure`) is
-written after each part; what it has of a scene and part is not measured again, so the same command goes on.  Last it prints
-the tables of docs/why-finite-differences-fail.md.
+A synthetic scene (`demo`) in float64 and float32, surfels in plain torch in float64, then each RUN, a folder of `landscape
+train`, in float32: the renderer gives images and their gradients, and the exact operators are the truth.  The table (columns:
+`notebooks.renderer.measure`) is written after each part; what it has of a scene and part is not measured again, so the same
+command goes on.  Last it prints the tables of docs/why-finite-differences-fail.md.
 
     landscape train data/fern --views 3 --iterations 2000 --seed 0 --out runs/fern
     python -m notebooks.renderer runs/fern --each 3 --seeds 2 --cover 0 --out notebooks/results/renderer.csv
@@ -25,6 +25,8 @@ from analysis.console.plain import say
 from analysis.records.provenance import provenance
 from notebooks.renderer.measure import Row, Sizes, best_step, ends, products, traces
 from notebooks.renderer.scenes import Scene, demo, trained
+from notebooks.renderer.surfels import Surfels
+from notebooks.renderer.surfels import trained as surfels
 from splat.model.untrusted import read_table, write_atomically
 
 RESULTS = Path(__file__).parents[1] / "results" / "renderer.csv"
@@ -49,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sizes = Sizes(options.each, options.seeds, options.samples, options.cover)
     rows: list[Row] = read_table(options.out).to_dict("records") if options.out.exists() else []
     small = demo()
-    for scene in [small, replace(small, dtype=torch.float32), *map(trained, options.runs)]:
+    for scene in [small, replace(small, dtype=torch.float32), surfels(), *map(trained, options.runs)]:
         for part in options.part or PARTS:
             if not _of(rows, scene, part):
                 rows += _measured(scene, part, sizes, rows)
@@ -60,10 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _measured(scene: Scene, part: str, sizes: Sizes, before: Sequence[Row]) -> Iterator[Row]:
+def _measured(scene: Scene | Surfels, part: str, sizes: Sizes, before: Sequence[Row]) -> Iterator[Row]:
     """The rows of a part, complete."""
     here = provenance(seed=0)
-    about = {"scene": scene.name, "gaussians": len(scene.objective.active), "type": scene.type}
+    about = {"scene": scene.name, "gaussians": scene.gaussians, "type": scene.type}
     about |= {"date": here.created[:10], "machine": here.machine.cpu, "commit": here.commit, "part": part}
     step = best_step(_of(before, scene, "products"))
     make = {
@@ -75,7 +77,7 @@ def _measured(scene: Scene, part: str, sizes: Sizes, before: Sequence[Row]) -> I
         yield about | row
 
 
-def _of(rows: Sequence[Row], scene: Scene, part: str) -> list[Row]:
+def _of(rows: Sequence[Row], scene: Scene | Surfels, part: str) -> list[Row]:
     """The rows of a scene and part."""
     return [row for row in rows if (row["scene"], row["type"], row["part"]) == (scene.name, scene.type, part)]
 

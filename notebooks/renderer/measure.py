@@ -23,6 +23,7 @@ from torch import Tensor
 
 from landscape import EigenSettings, RendererHessian, extreme_eigenpairs, gauss_newton_traces, renderer_eigenpairs
 from notebooks.renderer.scenes import Scene, directions
+from notebooks.renderer.surfels import Surfels
 
 STEPS = (1e-4, 1e-2, 1e-1, 1.0, 1e1)
 SPARSE = 2  # vectors of a kind for naive differences
@@ -62,7 +63,7 @@ class Naive:
         return torch.stack(columns, dim=1).to(V.dtype)
 
 
-def products(scene: Scene, sizes: Sizes) -> Iterator[Row]:
+def products(scene: Scene | Surfels, sizes: Sizes) -> Iterator[Row]:
     """Rows of all ways and directions."""
     H = scene.foreign()
     names, V = directions(H.blocks, H.dim, sizes.each)
@@ -88,7 +89,7 @@ def products(scene: Scene, sizes: Sizes) -> Iterator[Row]:
             yield {"way": "naive", "direction": name, "step": step, "error": rms(errors)}
 
 
-def ends(scene: Scene, sizes: Sizes, best: float) -> Iterator[Row]:
+def ends(scene: Scene | Surfels, sizes: Sizes, best: float) -> Iterator[Row]:
     """lambda max by every way.  best: the step of naive differences over the bridge's."""
     H = scene.foreign()
     exact = {
@@ -119,7 +120,7 @@ def ends(scene: Scene, sizes: Sizes, best: float) -> Iterator[Row]:
     }
 
 
-def traces(scene: Scene, sizes: Sizes) -> Iterator[Row]:
+def traces(scene: Scene | Surfels, sizes: Sizes) -> Iterator[Row]:
     """The traces with the first seed, and how many intervals of all seeds hold the exact ones."""
     H = scene.foreign()
     held = dict.fromkeys(H.blocks, 0)

@@ -45,6 +45,10 @@ class Scene:
     dtype: torch.dtype
 
     @property
+    def gaussians(self) -> int:
+        return len(self.objective.active)
+
+    @property
     def type(self) -> str:
         return str(self.dtype).removeprefix("torch.")
 

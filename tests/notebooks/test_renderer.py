@@ -1,5 +1,6 @@
 """The bridge on our own renderer: the smallest table is made and continued; the stored one holds, and is the page's."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,10 @@ import pandas as pd
 import pytest
 
 from notebooks.renderer import __main__ as command
+from notebooks.renderer import measure
 from notebooks.renderer.measure import STEPS
 from notebooks.renderer.scenes import demo
+from notebooks.renderer.surfels import trained as surfels
 
 ROOT = Path(__file__).parents[2]
 SMALLEST = ["--each", "1", "--seeds", "1", "--samples", "8", "--cover", "2"]
@@ -20,6 +23,8 @@ def made(tmp_path_factory):
     out = tmp_path_factory.mktemp("renderer") / "renderer.csv"
     patch = pytest.MonkeyPatch()
     patch.setattr(command, "demo", lambda: demo(gaussians=50, width=24, height=18, steps=10))
+    patch.setattr(measure, "FEW", replace(measure.FEW, max_matvecs=8))
+    patch.setattr(command, "surfels", lambda: surfels(gaussians=50, width=8, height=8, steps=3))
     assert command.main([*SMALLEST, "--out", str(out), "--part", "products"]) == 0
     first = pd.read_csv(out)
     assert command.main([*SMALLEST, "--out", str(out)]) == 0
@@ -30,7 +35,7 @@ def made(tmp_path_factory):
 def test_every_way_is_measured_and_what_is_there_is_kept(made):
     first, table = made
     assert list(first["error"]) == list(table[table["part"] == "products"]["error"])
-    for _, rows in table.groupby("type"):
+    for _, rows in table.groupby(["scene", "type"]):
         parts = rows["part"].value_counts().to_dict()
         assert parts == {"products": 7 * (2 + len(STEPS)), "ends": 3, "traces": 5, "cover": 5}
     assert table["commit"].notna().all() and table["machine"].notna().all()
