@@ -150,3 +150,9 @@ def written(call: ast.Call) -> str:
 def words(text: str) -> list[str]:
     """What is said, but for the numbers, which rounding on another processor may change."""
     return re.findall(r"[A-Za-z]{3,}", text)
+
+
+def test_surfels_through_one_derivative_are_those_of_double_backward():
+    _, names = story("other_renderers")
+    assert len(names["of_surfels"]) == 9 and all(names["of_surfels"])
+    assert names["of_litesplat"] is None or all(names["of_litesplat"])
