@@ -49,6 +49,7 @@ from landscape import (
 )
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
+from landscape.operators.operator import LiftedOperator
 from landscape.probes import spawn
 from landscape.spectrum.anisotropy import Anisotropy
 from landscape.spectrum.density import ActiveSpace
@@ -195,7 +196,8 @@ def measure(objective: SceneObjective, generator: torch.Generator, settings: Tra
     if not whole:
         eigen = replace(eigen, rtol=max(eigen.rtol, 0.1), max_matvecs=min(eigen.max_matvecs, COARSE_MATVECS))
     leads = BlockEigenvectors(objective, *objective.approximate_blocks).warm_start()
-    ends = extreme_eigenpairs(operator, streams[1], eigen, leads)
+    lifted = LiftedOperator(operator, hessian.project, spawn(streams[1]))  # as in a probe
+    ends = extreme_eigenpairs(lifted, streams[1], eigen, leads)
     density = None
     if whole:
         active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)

@@ -31,6 +31,8 @@ class PruneOptions:
     """Also score every --score at 0 to 95% removed, on training and held-out views, and after --curve-steps at 50% and 90%."""
     curve_steps: int = 300
     """Steps of training for the points of the curve with refinement; 0: none."""
+    curve_seeds: int = 3
+    """Seeds of that training, which say how far its end is decided."""
     sample: int = 200
     """Gaussians that are really removed, one at a time, as the truth that scores are compared with."""
     seed: int = 0

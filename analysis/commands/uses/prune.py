@@ -4,7 +4,8 @@
     scores.csv          every score (`splat.curvature.scores.removal`) of the Gaussians in sight, and `error`, the true rise of
                         the loss, where one was removed alone
     correlations.csv    rank correlations (Spearman) of the scores with that truth and with each other
-    curve.csv           with --curve: PSNR and SSIM by score, share removed, and steps of training after it; curve.png
+    curve.csv           with --curve: PSNR and SSIM by score, share removed, and steps of training after it and
+                        their seed; curve.png
     prune.json          where it comes from
 
 Gaussians that no training view sees go first.  What --curve has measured is kept until it is done: the same command continues.
@@ -36,7 +37,7 @@ from analysis.records.provenance import provenance_of
 from analysis.records.quantities import quantity
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError, did_you_mean
-from landscape.results import Progress
+from landscape.results import Progress, t_quantile
 from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.removal import EXACT, SCORES, removal_errors, removal_scores
 from splat.losses.reference import LossSettings
@@ -72,7 +73,7 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
         checkpoint, scene = subject.checkpoint, subject.scene
         objective, l2 = (subject.objective(loss=loss) for loss in (None, L2))
         held_out = scene.load(checkpoint.scene.test) if checkpoint.scene.test else []
-    amounts = {name: getattr(options, name) for name in ("curve", "curve_steps", "sample", *CHOICE)}
+    amounts = {name: getattr(options, name) for name in ("curve", "curve_steps", "curve_seeds", "sample", *CHOICE)}
     tested = {name: checkpoint.scene.views[name] for name in checkpoint.scene.test}
     made = checkpoint.fingerprint(amounts, options.seed, further=tested)
     identity = made.but(*(f"settings.{name}" for name in CHOICE)).digest
@@ -104,7 +105,7 @@ def _require_sensible(options: PruneOptions) -> None:
     if not 0 < options.keep <= 1:
         hint = f"; for {options.keep:g}% say --keep {options.keep / 100:g}" if 1 < options.keep <= 100 else ""
         raise InputError(f"expected --keep as a share above 0 and up to 1, got {options.keep:g}{hint}")
-    for name, least in {"refine": 0, "curve_steps": 0, "sample": 3}.items():
+    for name, least in {"refine": 0, "curve_steps": 0, "curve_seeds": 2, "sample": 3}.items():
         if (value := getattr(options, name)) < least:
             raise InputError(f"expected --{name.replace('_', '-')} of at least {least}, got {value}")
     if options.score not in SCORES:
@@ -183,25 +184,27 @@ def _curve(
     scores: dict[str, Float64[Tensor, " n"]],
     options: PruneOptions,
 ) -> pd.DataFrame:
-    """The scene's measures by score, share removed, and steps of training after it."""
+    """The scene's measures by score, share removed, and steps of training after it, for each of its seeds."""
 
     def points(
-        name: str, steps: int, shares: Sequence[float], _: torch.Generator, report: Progress, __: list[str]
+        name: str, steps: int, at: Sequence[tuple[float, int]], _: torch.Generator, report: Progress, __: list[str]
     ) -> list[Row]:
         rows = []
-        for done, removed in enumerate(shares):
+        for done, (removed, seed) in enumerate(at):
             training = pruned(checkpoint.training, objective, scores[name], 1 - removed)
-            refine(training, objective.views, steps, options.seed)
+            refine(training, objective.views, steps, seed)
             found = _scored(training.gaussians, objective, held_out)
-            rows.append({"score": name, "removed": removed, "steps": steps, **found})
-            report(done + 1, len(shares), name)
+            rows.append({"score": name, "removed": removed, "steps": steps, "seed": seed, **found})
+            report(done + 1, len(at), name)
         return rows
 
-    rows: list[Row] = []
+    rows, first = list[Row](), options.seed
+    plain = [(removed, first) for removed in REMOVED]
+    refined = [(removed, seed) for removed in REFINED for seed in range(first, first + options.curve_seeds)]
     for name in SCORES:
-        rows += kept.run(name, list[Row], partial(points, name, 0, REMOVED)) or []
+        rows += kept.run(name, list[Row], partial(points, name, 0, plain)) or []
         if steps := options.curve_steps:
-            rows += kept.run(f"{name} refined", list[Row], partial(points, name, steps, REFINED)) or []
+            rows += kept.run(f"{name} refined", list[Row], partial(points, name, steps, refined)) or []
     return pd.DataFrame(rows)
 
 
@@ -215,10 +218,29 @@ def _scored(gaussians: Gaussians, objective: SceneObjective, held_out: Sequence[
     return found
 
 
-def lost(curve: pd.DataFrame, removed: float, steps: int, column: str) -> dict[str, float]:
-    """Loss of a measure by each score, against the scene with all its Gaussians."""
-    rows = {(row["score"], row["removed"], row["steps"]): row[column] for row in curve.to_dict("records")}
-    return {score: rows[score, 0, 0] - rows[score, removed, steps] for score in SCORES}
+def lost(curve: pd.DataFrame, removed: float, steps: int, column: str) -> pd.DataFrame:
+    """Loss of a measure by each score, against the scene with all its Gaussians; a row for each seed of the steps."""
+    at = curve[(curve["removed"] == removed) & (curve["steps"] == steps)]
+    whole = curve.loc[curve["removed"] == 0].groupby("score")[column].first()
+    return whole - at.pivot_table(column, "seed", "score")
+
+
+def verdict(losses: pd.DataFrame) -> str:
+    """What the losses by seed say of the best score of exact curvature and of opacity, by Student's interval of 95%.
+
+    >>> seeds = pd.DataFrame({name: [1.0, 1.0] for name in SCORES} | {"removal_error": [0.2, 0.3], "opacity": [0.6, 0.8]})
+    >>> verdict(seeds), verdict(seeds[:1])
+    ('removal_error and opacity: undecided over 2 seeds', 'removal_error loses 0.400 dB less than opacity')
+    >>> verdict(seeds.assign(opacity=[0.25, 0.351])).split()[1:6]
+    ['loses', '0.0505', '±', '0.0064', 'dB']
+    """
+    best = min(EXACT, key=lambda name: losses[name].mean())
+    gain, n = losses["opacity"] - losses[best], len(losses)
+    error = t_quantile(n - 1, 0.95) * float(gain.std()) / n**0.5 if n > 1 else 0.0
+    if abs(gain.mean()) <= error:
+        return f"{best} and opacity: undecided over {n} seeds"
+    than = "less" if gain.mean() > 0 else "more"
+    return f"{best} loses {quantity(abs(gain.mean()), error)} dB {than} than opacity"
 
 
 def _conclude(
@@ -228,20 +250,21 @@ def _conclude(
     measure = "test_psnr" if "test_psnr" in result else "train_psnr"
     say("rank: Spearman's correlation with the true rise of the loss")
     if columns:
-        say(f"further columns: {measure.split('_')[0]} PSNR lost at that share removed, dB")
+        say(
+            f"further columns: {measure.split('_')[0]} PSNR lost at that share removed, dB; ±: the standard deviation over "
+            "seeds of the steps after it.  All of one training"
+        )
     table = Table()
     titles = [f"{removed:.0%}{f', {steps} steps' if steps else ''}" for removed, steps in columns]
     for title in ("score", "rank", *titles):
         table.add_column(title, justify="left" if title == "score" else "right")
     losses = [lost(curve, *at, measure) for at in columns] if curve is not None else []
     for name in SCORES:
-        table.add_row(name, quantity(ranks.loc[TRUTH, name]), *(f"{loss[name]:.2f} dB" for loss in losses))
+        cells = [quantity(loss[name].mean(), loss[name].std() if len(loss) > 1 else None) for loss in losses]
+        table.add_row(name, quantity(ranks.loc[TRUTH, name]), *cells)
     Console().print(table)
     for (removed, steps), loss in zip(columns, losses, strict=True):
-        best = min(EXACT, key=lambda name, of=loss: of[name])
-        found = f"{best} loses {loss[best]:.2f} dB, opacity {loss['opacity']:.2f} dB"
-        limit = f"; undecided, because those {steps} steps have one seed" if steps else ", of this one training"
-        say(f"{removed:.0%} removed, {steps} steps after: {found}{limit}")
+        say(f"{removed:.0%} removed, {steps} steps after: {verdict(loss)}")
     scored = ", ".join(
         f"{name.replace('_', ' ')} {quantity(value)}" for name, value in result.items() if np.isfinite(value)
     )

@@ -57,7 +57,9 @@ def test_the_highest_scores_are_kept_in_both_files(curved, folder):
 
 def test_the_curve_scores_what_is_left(curved):
     curve, loaded = pd.read_csv(curved / "curve.csv"), load_checkpoint(curved / "checkpoint.pt")
-    assert {*curve.score} == {*SCORES} and len(curve) == len(SCORES) * (len(prune.REMOVED) + len(prune.REFINED))
+    assert {*curve.score} == {*SCORES} and len(curve) == len(SCORES) * (len(prune.REMOVED) + 3 * len(prune.REFINED))
+    lost = prune.lost(curve, 0.9, 2, "train_psnr")
+    assert lost.shape == (3, len(SCORES)) and lost["opacity"].nunique() == 3  # seeds
     path, views = curved / "checkpoint.pt", loaded.scene
     kept = evaluate(loaded.training.gaussians, loaded.with_scene(path).scene.load(views.test))
     row = curve[(curve.score == "opacity") & (curve.removed == 0.6) & (curve.steps == 0)].iloc[0]
@@ -99,14 +101,15 @@ def test_a_curve_that_is_stopped_goes_on(folder, curved, tmp_path, monkeypatch):
     words = [*QUICK, "--out", str(tmp_path / "out")]
     assert run(folder, *words) == 130 and not (tmp_path / "out").exists()
     assert run(folder, *words) == 0
-    every = len(SCORES) * (len(prune.REMOVED) + len(prune.REFINED)) + 1
-    assert len(calls) == every + 7  # of the second score, which was under way
+    every = len(SCORES) * (len(prune.REMOVED) + 3 * len(prune.REFINED)) + 1
+    assert len(calls) == every + 3  # of the second score, which was under way
     assert (tmp_path / "out" / "curve.csv").read_text() == (curved / "curve.csv").read_text()
     assert not (tmp_path / ".out.unfinished").exists()
 
 
 @pytest.mark.parametrize("words", [
-    ("--keep", "0"), ("--score", "opacty"), ("--sample", "1"), ("--refine", "-1"), ("--curve-steps", "-2")
+    ("--keep", "0"), ("--score", "opacty"), ("--sample", "1"), ("--refine", "-1"), ("--curve-steps", "-2"),
+    ("--curve-seeds", "1"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_alone(folder, words, capsys):
     assert run(folder, *words) == 2
