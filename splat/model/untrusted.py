@@ -338,8 +338,8 @@ def replacing(path: Path, *, folder: bool = False) -> Iterator[Path]:
         _remove(partial)
         if folder and previous.exists() and not path.exists():
             previous.rename(path)
-        if isinstance(error, OSError) and error.errno and error.filename is None:
-            error.filename = str(path)  # a full disk's error has none
+        if isinstance(error, OSError) and error.errno:  # a full disk's has no name, others one that nobody gave
+            error.filename = str(error.filename or path).replace(str(partial), str(path))
         raise
     _remove(previous if folder else partial)
     for abandoned in path.parent.glob(f".{glob.escape(short(path.name))}.partial-*"):  # of killed processes
@@ -357,7 +357,7 @@ def short(name: str) -> str:
 def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
-    else:
+    elif os.path.lexists(path):  # which a name below a file is not
         path.unlink(missing_ok=True)
 
 

@@ -148,6 +148,14 @@ def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch, dies):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.parametrize("folder", [False, True])
+def test_what_cannot_be_written_is_named_as_it_was_asked_for(tmp_path, folder):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError) as caught, replacing(tmp_path / "file" / "out", folder=folder) as partial:
+        (partial / "a" if folder else partial).write_bytes(b"")
+    assert str(caught.value.filename) == str(tmp_path / "file" / ("" if folder else "out"))
+
+
 def test_a_name_as_long_as_the_system_allows_can_be_written(tmp_path):
     path = tmp_path / ("é" * 125 + ".png")  # 254 bytes
     write_atomically(path, b"picture")
