@@ -12,6 +12,7 @@
     evaluate                    PSNR, SSIM, LPIPS of views
     open_subject                a run, a checkpoint or another tool's file, with its scene
     Foreign                     what another tool's file does not say
+    load_checkpoint             the training of one of our own, whose scene need not be there
     SceneObjective              the mean loss over views as a function of the Gaussians' parameters
     SceneHessian                its Hessian as an operator for the estimators of `landscape`
     exact_traces                the traces of its blocks

@@ -11,6 +11,7 @@ from .scenes.splits import split_scene as split_scene
 from .scenes.synthetic import SyntheticSettings as SyntheticSettings
 from .scenes.synthetic import synthetic_scene as synthetic_scene
 from .scenes.view import View as View
+from .training.checkpoint import load_checkpoint as load_checkpoint
 from .training.checkpoint import open_subject as open_subject
 from .training.loop import train as train
 from .training.methods.methods import METHODS as METHODS

@@ -1,5 +1,6 @@
 """Commands on a tiny scene that somebody ends at a random moment, and what they come to when nobody does."""
 
+import argparse
 import io
 import json
 import random
@@ -47,13 +48,27 @@ def attempts(name: str, trials: Iterable[tuple[str, Callable[[], str]]]) -> list
     return failures
 
 
+def attacked(about: str | None, attack: Callable[[str, int, int], list[str]], commands: list[str], rounds: int) -> int:
+    """The program that attacks commands so many times, from a seed; 1 where something went wrong."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("commands", nargs="*", default=commands)
+    parser.add_argument("--rounds", type=int, default=rounds)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    return int(sum(len(attack(name, options.rounds, options.seed)) for name in options.commands) > 0)
+
+
 class Ended:
     """A command on a tiny scene in `root`, and what it comes to when nobody ends it."""
 
     name: ClassVar[str]
-    module = cli  # whose `main` it is
+    typed: str  # with {scene}, {checkpoint} and {run} that it reads, {other} and {file} beside them, and {out}
+    content = ""  # of the file
+    module: Any = cli  # whose `main` it is
     apart = 0.2  # share of the rounds that run a program of its own
     goes_on = False  # from files in `out`, which are replaced one by one
+    fresh = False  # whether each round begins with nothing
+    least = 0.0  # seconds
 
     def __init__(self, root: Path) -> None:
         self.out, self.scene, self.checkpoint = root / "work" / "out", root / "scene", root / "run" / "checkpoint.pt"
@@ -63,17 +78,25 @@ class Ended:
         self.clean()
         start = time.monotonic()
         self.run_to_its_end()
-        self.seconds, self.expected = time.monotonic() - start, self.numbers()
+        self.seconds, self.expected = max(time.monotonic() - start, self.least), self.numbers()
 
     def made_before(self) -> None:
-        """The scene and the run that the command reads."""
+        """The scene, the run and the file that the command reads."""
         settings = SyntheticSettings(gaussians=60, views=5, width=24, height=18)
         assert forked(lambda: write_transforms_scene(synthetic_scene(settings).scene, self.scene) or 0).wait() == 0
-        train = ["train", str(self.scene), "--out", str(self.checkpoint.parent), "--iterations", str(TRAINED)]
-        assert forked(lambda: cli.main(train)).wait() == 0
+        self.typed_as(f"train {{scene}} --out {{run}} --iterations {TRAINED}")
+        self.scene.with_name("file.toml").write_text(self.content)
+
+    def typed_as(self, words: str) -> None:
+        assert forked(lambda: cli.main(self.filled(words))).wait() == 0
+
+    def filled(self, words: str) -> list[str]:
+        root = self.scene.parent
+        names = {"run": root / "run", "other": root / "other", "file": root / "file.toml"}
+        return words.format(scene=self.scene, checkpoint=self.checkpoint, out=self.out, **names).split()
 
     def words(self) -> list[str]:
-        raise NotImplementedError
+        return self.filled(self.typed)
 
     def numbers(self) -> Numbers:
         """All that does not depend on the time.  InputError where the result is not whole."""
@@ -92,7 +115,7 @@ class Ended:
 
     def prepare(self, chance: random.Random) -> None:
         """What is there before: nothing, or what the command wrote before."""
-        if chance.random() < 0.5:
+        if self.fresh or chance.random() < 0.5:
             self.clean()
 
     def round(self, chance: random.Random, number: int) -> str:

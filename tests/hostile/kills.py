@@ -7,35 +7,28 @@ this one, in which everything is imported but nothing has been run, and which dr
 its own, which does.
 """
 
-import argparse
-import math
 import random
 import signal
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 from tests.hostile.commands import COMMANDS
-from tests.hostile.ended import Ended, attempts
+from tests.hostile.ended import Ended, attacked, attempts
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
-def attack(name: str, rounds: int, seed: int, minutes: float) -> list[str]:
-    """So many kills and as many signals, or as many as there is time for; what went wrong."""
-    end = time.monotonic() + 60 * minutes
+def attack(name: str, rounds: int, seed: int) -> list[str]:
+    """So many kills and as many signals; what went wrong."""
 
     def trials(command: Ended) -> Iterator[tuple[str, Callable[[], str]]]:
         for round in range(2 * rounds):
-            if time.monotonic() > end:
-                return
             chance = random.Random(f"{name} {seed} {round}")
             number = signal.SIGKILL if round % 2 else chance.choice(SIGNALS)
-            words = f"round {round}, {signal.Signals(number).name}"
-            yield words, partial(_ended, command, chance, number)
+            yield f"round {round}, {signal.Signals(number).name}", partial(_ended, command, chance, number)
 
     with tempfile.TemporaryDirectory() as folder:
         command = COMMANDS[name](Path(folder))
@@ -48,11 +41,4 @@ def _ended(command: Ended, chance: random.Random, number: int) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("commands", nargs="*", default=[*COMMANDS])
-    parser.add_argument("--rounds", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--minutes", type=float, default=math.inf, help="for each command")
-    options = parser.parse_args()
-    failures = [attack(name, options.rounds, options.seed, options.minutes) for name in options.commands]
-    sys.exit(any(map(bool, failures)))
+    sys.exit(attacked(__doc__, attack, [*COMMANDS], 50))

@@ -5,7 +5,6 @@ and its checkpoint is read while they are at work.  At least one must come to it
 say why in one sentence.  The numbers in the end must be the bits of one that was alone.
 """
 
-import argparse
 import random
 import signal
 import sys
@@ -15,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from tests.hostile.commands import COMMANDS
-from tests.hostile.ended import Ended, attempts
+from tests.hostile.ended import Ended, attacked, attempts
 from tests.hostile.programs import forked
 
 BAD_INPUT = 2
@@ -66,10 +65,4 @@ def attack(name: str, rounds: int, seed: int) -> list[str]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("commands", nargs="*", default=["train"])
-    parser.add_argument("--rounds", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    failures = [attack(name, options.rounds, options.seed) for name in options.commands]
-    sys.exit(any(map(bool, failures)))
+    sys.exit(attacked(__doc__, attack, ["train"], 1000))

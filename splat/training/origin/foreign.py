@@ -67,7 +67,7 @@ def foreign_training(
     photographs = Photographs(scene, names, config, centred=preset.centred)
     found_in = partial(_readings, found, scene, path)
     reading = photographs.best(found_in(preset.world), lambda best: _mistaken(best, preset.world, found_in))
-    level = photographs.require(reading, lambda image: _suspicion(image, config, name), picture)
+    level = photographs.require(reading, picture)
     similarity = reading.similarity
     reference = replace(reference, similarity=similarity, centred=preset.centred)
     moved = posed(scene, similarity, centred=preset.centred)
@@ -237,17 +237,3 @@ def _near(gaussians: Gaussians, world: Similarity | None) -> Gaussians:
     if means.median(dim=0).values.norm() > away.norm() / 2:
         means = means - away
     return replace(gaussians, flat=Gaussians.pack(gaussians.attributes | {"means": means.to(gaussians.flat)}).flat)
-
-
-def _suspicion(image: torch.Tensor, config: TrainConfig, name: str) -> str:
-    """Guess at what is wrong."""
-    bare = (image - config.background_colour(image.dtype)[:, None, None]).abs().amax(dim=0) < 1 / 255
-    if bare.float().mean() > 0.5:
-        return (
-            "is this their scene? else they are hardly in sight because their world is not that of "
-            f"{name}'s cameras; name another --trained-by, such as gsplat where the world was normalised"
-        )
-    return (
-        "is this their scene? else it is other images (--images, --downscale), or another trainer (--trained-by), whose world "
-        "or signs differ"
-    )

@@ -116,7 +116,7 @@ class Photographs:
         ]
         return [render(gaussians, camera, background, self.config.render).image for camera in cameras]
 
-    def require(self, reading: Reading, suspicion: Callable[[torch.Tensor], str], picture: Path) -> float:
+    def require(self, reading: Reading, picture: Path) -> float:
         """PSNR of a reading, dB, in the pictures' own size.
 
         Colours are compared as the loss does, not cut to [0, 1].  InputError below LEAST_PSNR, or below MARGIN above what
@@ -130,7 +130,8 @@ class Photographs:
             picture.write_bytes(png(bytes_of(both)))
             raise InputError(
                 f"expected Gaussians that look like the scene's photographs, got {level:.1f} dB on training views (at least "
-                f"{wanted:.1f}; pictures of one colour have {plain(self.views):.1f}); {suspicion(images[0])}; "
+                f"{wanted:.1f}; pictures of one colour have {plain(self.views):.1f}); is this their scene? else it is "
+                "other images (--images, --downscale), or another trainer (--trained-by), whose world or signs differ; "
                 f"{picture} shows the render beside the photograph"
             )
         return level
