@@ -4,7 +4,6 @@
     View, load_scene            a camera with its picture; a scene of them from a folder of any usual format
     split_scene                 names of training and test views by the protocols of the field
     SyntheticSettings, synthetic_scene    a small scene whose Gaussians are known
-    RenderSettings              the thresholds of the renderer
     LossSettings                the loss of an image against its picture
     initial_gaussians           the start of a training, from points or at random
     TrainConfig, Training, train    what a training does; its state; its steps

@@ -5,7 +5,6 @@ from .curvature.traces import exact_traces as exact_traces
 from .losses.reference import LossSettings as LossSettings
 from .model.camera import Camera as Camera
 from .model.gaussians import Gaussians as Gaussians
-from .model.settings import RenderSettings as RenderSettings
 from .scenes.scene import load_scene as load_scene
 from .scenes.splits import split_scene as split_scene
 from .scenes.synthetic import SyntheticSettings as SyntheticSettings
