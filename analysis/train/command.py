@@ -33,7 +33,7 @@ from analysis.console.overrides import assignments, overridden
 from analysis.console.plain import say
 from analysis.records.run_files import CHECKPOINT
 from analysis.train.options import TrainOptions
-from analysis.train.progress import TrainingProgress, scalar_writer
+from analysis.train.progress import TrainingProgress, tracker
 from analysis.train.remarks import begins, remarks
 from analysis.train.scores import report
 from analysis.train.source import from_checkpoint
@@ -132,8 +132,8 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
             raise InputError(f"expected {name} of at least 1, got {value}")
     if options.keep_checkpoints != "all" and options.keep_checkpoints < 0:
         raise InputError(f"expected keep_checkpoints of at least 0, or all, got {options.keep_checkpoints}")
-    if options.tensorboard:
-        scalar_writer()  # refuses before anything is loaded
+    if options.track:
+        tracker(options.track)  # refuses before anything is loaded
     along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_quick)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
@@ -277,7 +277,7 @@ def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, cons
     """Train to the end, with checkpoints; returns 0, or the exit code of the signal that ended it before."""
     training, spent = run.training, TrainingTime.read(run.out)
     total = training.config.iterations
-    progress = TrainingProgress(run.out, training, run.views[0], options.log_every, console, options.tensorboard)
+    progress = TrainingProgress(run.out, training, run.views[0], options.log_every, console, options.track)
     with interruption() as interrupted, progress:
         progress.begin(spent)
         if trajectory:

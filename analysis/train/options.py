@@ -12,7 +12,10 @@ from splat.training.origin.options import Trainer
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Train 3D Gaussian Splatting on a few views of a scene and score it on the views held out."""
+    """Train 3D Gaussian Splatting on a few views of a scene and score it on the views held out.
+
+    LPIPS stands among the scores where its package is installed: pip install 'splat-landscape[lpips]'.
+    """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
     """COLMAP, LLFF, Blender, instant-ngp, nerfstudio, DTU."""
@@ -69,8 +72,8 @@ class TrainOptions:
     """How many stay as OUT/step-K, or all."""
     log_every: int = 100
     """Steps between rows of OUT/train.csv."""
-    tensorboard: bool = False
-    """Also write them to OUT/tensorboard."""
+    track: Annotated[Literal["tensorboard", "wandb", "trackio"] | None, arg(metavar="NAME")] = None
+    """Also give them to tensorboard (in OUT/tracked), wandb or trackio."""
     probe_every: int | None = None
     """Steps between records in OUT/trajectory.csv."""
     probe_quick: bool = False

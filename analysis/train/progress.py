@@ -1,7 +1,7 @@
-"""Progress of a training: rows of RUN/train.csv, a line of the terminal for each where there is no bar, TensorBoard if asked.
+"""Progress of a training: rows of RUN/train.csv, a line of the terminal for each where there is no bar, a tracker if asked.
 
 RUN/train.csv           a row before the first step, every --log-every steps and after the last; complete lines at any time
-RUN/tensorboard/        with --tensorboard: the same numbers as TensorBoard's scalars
+RUN/tracked/            with --track: the same numbers for TensorBoard, Weights & Biases or trackio
 
 Columns:
 
@@ -10,9 +10,12 @@ loss, psnr         of the first training view as it would be rendered then: the 
 seconds, cpu       that the steps so far took, by the clock and of all processors together, without loading, saving and scoring
 """
 
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import import_module
 from math import inf, isnan, nan
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from rich.console import Console
@@ -31,7 +34,7 @@ from splat.training.checkpoint import write_atomically
 from splat.training.loop import StepResult
 from splat.training.state import Training
 
-LOG, TENSORBOARD = "train.csv", "tensorboard"
+LOG, TRACKED = "train.csv", "tracked"
 COLUMNS = ("step", "loss", "psnr", "gaussians", "seconds", "cpu")
 EARLY, FAST = (
     0.1,
@@ -43,18 +46,16 @@ SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and 
 class TrainingProgress:
     """A context manager; rows that an interrupted run left after the training's step are dropped.
 
-    every: steps between rows; scalars: TensorBoard's, for which InputError where it is not installed.
+    every: steps between rows; track: the name of a tracker, for which InputError where it is not installed.
     """
 
     def __init__(
-        self, run: Path, training: Training, view: View, every: int, console: Console, tensorboard: bool = False
+        self, run: Path, training: Training, view: View, every: int, console: Console, track: str | None = None
     ) -> None:
         self.training, self.view, self.every, self.console = training, view, every, console
         self.loss, self.begun = nan, (training.step, 0.0)
         self.most = inf if training.step else FAST * len(training.gaussians)  # Gaussians, before it says why
-        self.scalars: Any = None
-        if tensorboard:
-            self.scalars = scalar_writer()(str(run / TENSORBOARD), purge_step=training.step + 1)
+        self.tracker = tracker(track)(run, training.step) if track else None
         write_atomically(run / LOG, "".join([",".join(COLUMNS) + "\n", *kept_rows(run / LOG, training.step)]).encode())
         self.file = (run / LOG).open("a", encoding="utf-8", newline="")
         self.bars = Progress(
@@ -78,8 +79,8 @@ class TrainingProgress:
     def __exit__(self, *_: object) -> None:
         self.bars.stop()
         self.file.close()
-        if self.scalars is not None:
-            self.scalars.close()
+        if self.tracker is not None:
+            self.tracker.close()
 
     def begin(self, spent: TrainingTime) -> None:
         """spent: in the steps of an interrupted run."""
@@ -117,10 +118,8 @@ class TrainingProgress:
         loss, ratio, gaussians = *scored(self.training, self.view), len(self.training.gaussians)
         self.file.write(f"{step},{loss!r},{ratio!r},{gaussians},{seconds:.3f},{spent.cpu:.3f}\n")
         self.file.flush()
-        if self.scalars is not None:
-            for name, value in {"loss": loss, "psnr": ratio, "gaussians": gaussians}.items():
-                self.scalars.add_scalar(name, value, step)
-            self.scalars.flush()
+        if self.tracker is not None:
+            self.tracker.add({"loss": loss, "psnr": ratio, "gaussians": gaussians}, step)
         if not self.console.is_terminal:
             steps, time = step - self.begun[0], seconds - self.begun[1]
             left = f", about {time / steps * (total - step):.0f} s left" if steps and step < total else ""
@@ -141,16 +140,59 @@ def scored(training: Training, view: View) -> tuple[float, float]:
     return float(loss) + regularizers.value, psnr(image.to(view.image.device), view.image)
 
 
-def scalar_writer() -> Any:
-    """TensorBoard's writer of scalars.  InputError where it is not installed."""
+class Tracker(Protocol):
+    """What takes the rows of a run, beginning after the step that it was made with."""
+
+    def add(self, values: Mapping[str, float], step: int) -> object: ...
+    def close(self) -> object: ...
+
+
+class TensorBoard:
+    """Scalars in RUN/tracked; those of an interrupted run after its last checkpoint are dropped."""
+
+    def __init__(self, module: Any, run: Path, step: int) -> None:
+        self.writer = module.SummaryWriter(str(run / TRACKED), purge_step=step + 1)
+
+    def add(self, values: Mapping[str, float], step: int) -> None:
+        for name, value in values.items():
+            self.writer.add_scalar(name, value, step)
+        self.writer.flush()
+
+    def close(self) -> None:
+        self.writer.close()
+
+
+class Remote:
+    """Weights & Biases, or trackio, whose calls are the same: a run of the project "landscape" with the name of the folder."""
+
+    def __init__(self, module: Any, run: Path, step: int) -> None:
+        self.module = module
+        module.init(project="landscape", name=run.name)
+
+    def add(self, values: Mapping[str, float], step: int) -> None:
+        self.module.log(dict(values), step=step)
+
+    def close(self) -> None:
+        self.module.finish()
+
+
+TRACKERS = {
+    "tensorboard": ("torch.utils.tensorboard", TensorBoard),
+    "wandb": ("wandb", Remote),
+    "trackio": ("trackio", Remote),
+}
+
+
+def tracker(name: str) -> Callable[[Path, int], Tracker]:
+    """Makes a tracker of a run, from the step it is at.  InputError where its package is not installed."""
+    module, kind = TRACKERS[name]
     try:
-        from torch.utils.tensorboard import SummaryWriter  # pyright: ignore[reportPrivateImportUsage]
+        return partial(kind, import_module(module))
     except ImportError as error:
         raise InputError(
-            f"expected the package tensorboard for --tensorboard ({error}); install it with pip install -e '.[tensorboard]', "
-            f"or leave the option out: {LOG} holds the same numbers"
+            f"expected the package {name} for --track {name} ({error}); install it with pip install {name}, or leave the "
+            f"option out: {LOG} holds the same numbers"
         ) from None
-    return SummaryWriter
 
 
 def kept_rows(path: Path, step: int) -> list[str]:

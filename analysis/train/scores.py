@@ -56,7 +56,8 @@ def report(training: Training, views: Sequence[View], held_out: Sequence[View], 
         lpips = load_lpips()
     except MissingPerceptual as error:
         lpips = None
-        say(str(error), console=console)
+        if not isinstance(error.__cause__, ModuleNotFoundError):  # installed, and yet it does not run
+            say(str(error), console=console)
     seen = evaluate(training.gaussians, views, background, config.render, lpips=lpips)
     tested = None
     if held_out:

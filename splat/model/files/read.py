@@ -5,7 +5,9 @@ import io
 import re
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from splat.model.files import quantised, tensor_files
 from splat.model.files.ply import MAGIC, read_header
 from splat.model.files.splat_file import SplatFile
 from splat.model.files.splat_ply import read_splat_ply
+from splat.model.plugins import added
 from splat.model.untrusted import require_content, require_modest
 
 ZIP_MAGIC, LICHTFELD = b"PK\x03\x04", (b"LFKP", b"PKFL")
@@ -43,7 +46,7 @@ def is_foreign(path: Path) -> bool:
         start = file.read(4)
         if not start.startswith(ZIP_MAGIC):
             known = (MAGIC, quantised.GZIP_MAGIC, quantised.SPZ_MAGIC, *LICHTFELD)
-            return start.startswith(known) or path.suffix.lower() == ".splat"
+            return start.startswith(known) or path.suffix.lower() == ".splat" or _suffix(path) in _others()
         try:
             with zipfile.ZipFile(file) as archive:
                 require_modest(archive)
@@ -88,7 +91,22 @@ def _read(path: Path, content: bytes) -> SplatFile:
         return quantised.read_sog(content) if sog else tensor_files.read_tensor_file(path, content)
     if path.suffix.lower() == ".splat" and content and len(content) % quantised.SPLAT.itemsize == 0:
         return quantised.read_dot_splat(content)  # which has no mark of its own
+    if reader := _others().get(_suffix(path)):
+        found = reader(content)
+        if not isinstance(found, SplatFile):
+            raise InputError(f"its reader gave {type(found).__name__}, not a SplatFile: mend the package that has it")
+        return found
     raise InputError("it is none of them")
+
+
+def _suffix(path: Path) -> str:
+    return path.suffix.lower().removeprefix(".")
+
+
+@cache
+def _others() -> dict[str, Callable[[bytes], SplatFile]]:
+    """Readers of installed packages, by suffix."""
+    return added("landscape.files", ("ply", "splat", "spz", "sog", "pt", "pth", "ckpt"))
 
 
 def _with_settings(found: SplatFile, path: Path) -> SplatFile:

@@ -10,11 +10,14 @@ dngaussian      depth has the shape of the user's depth maps, globally and in sm
 cor-gs          two fields: each keeps the Gaussians that the other confirms, and agrees with it between the views
 newton-blocks   in place of Adam: every Gaussian's own damped Newton step, all views at once, no density control
 gn-cg           in place of Adam: Gauss-Newton by conjugate gradients over all parameters, likewise
+...             those of installed packages (`splat.model.plugins`)
 
 >>> METHODS["stablegs"](warm_up=100).warm_up
 100
 """
 
+from landscape.errors import InputError
+from splat.model.plugins import added
 from splat.training.methods.corgs import CoRGS
 from splat.training.methods.depth.dngaussian import DNGaussian
 from splat.training.methods.depth.fsgs import FSGS
@@ -41,3 +44,9 @@ METHODS: dict[str, type[MethodSettings]] = {
         GaussNewtonCG,
     )
 }
+for _name, _method in added("landscape.methods", tuple(METHODS)).items():
+    if not (isinstance(_method, type) and issubclass(_method, MethodSettings) and _method.name == _name):
+        raise InputError(
+            f"expected a subclass of MethodSettings whose name is {_name!r}, got {_method!r}; mend its package"
+        )
+    METHODS[_name] = _method

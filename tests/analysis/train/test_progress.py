@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pandas as pd
 import pytest
@@ -109,18 +110,33 @@ def test_tensorboard_is_given_the_rows(original, tmp_path):
     reader = "tensorboard.backend.event_processing.event_accumulator"
     package = pytest.importorskip(reader, reason="pip install -e '.[tensorboard]'")
     out = tmp_path / "run"
-    assert main(words(original, out, "--tensorboard")) == 0
-    events, table = package.EventAccumulator(str(out / "tensorboard")).Reload(), pd.read_csv(out / "train.csv")
+    assert main(words(original, out, "--track", "tensorboard")) == 0
+    events, table = package.EventAccumulator(str(out / "tracked")).Reload(), pd.read_csv(out / "train.csv")
     for name in ("loss", "psnr", "gaussians"):
         found = events.Scalars(name)
         assert [each.step for each in found] == list(table["step"])
         assert [each.value for each in found] == pytest.approx(list(table[name]), rel=1e-6)
 
 
+@pytest.mark.parametrize("name", ["wandb", "trackio"])
+def test_other_trackers_are_given_the_rows_by_the_calls_that_they_share(original, tmp_path, monkeypatch, name):
+    module, calls = ModuleType(name), []
+    for call in ("init", "log", "finish"):
+        monkeypatch.setattr(module, call, lambda *a, call=call, **named: calls.append((call, a, named)), raising=False)
+    monkeypatch.setitem(sys.modules, name, module)
+    assert main(words(original, tmp_path / "run", "--track", name)) == 0
+    first, *rows, last = calls
+    assert first == ("init", (), {"project": "landscape", "name": "run"}) and last == ("finish", (), {})
+    table = pd.read_csv(tmp_path / "run" / "train.csv")
+    assert [named["step"] for _, _, named in rows] == list(table["step"])
+    assert [values["loss"] for _, (values,), _ in rows] == list(table["loss"])
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--tensorboard"], "pip install -e '.[tensorboard]'"),
+        (["--track", "tensorboard"], "pip install tensorboard"),
+        (["--track", "trackio"], "pip install trackio"),
         (["--keep-checkpoints", "-1"], "expected keep_checkpoints of at least 0, or all, got -1"),
         (["--log-every", "0"], "expected log_every of at least 1, got 0"),
     ],
@@ -128,7 +144,8 @@ def test_tensorboard_is_given_the_rows(original, tmp_path):
 def test_what_cannot_be_done_is_refused_before_there_is_a_folder(
     original, tmp_path, capsys, monkeypatch, more, message
 ):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    for name in ("torch.utils.tensorboard", "trackio"):
+        monkeypatch.setitem(sys.modules, name, None)
     assert main(words(original, tmp_path / "run", *more)) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "run").exists()
 

@@ -153,13 +153,16 @@ def test_a_world_far_from_its_origin_is_planned_near_it_and_loaded_again_as_it_w
     assert planned(TrainOptions(original, views=2), tmp_path / "run")[3].similarity is None
 
 
-def test_without_lpips_the_metric_is_left_out_in_one_sentence_and_null_in_the_record(
+def test_without_lpips_the_metric_is_null_in_the_record_and_the_help_says_how_to_have_it(
     original, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, "lpips", None)
     assert train(original, tmp_path / "run") == 0
     said = capsys.readouterr().out
-    assert sum("LPIPS" in line for line in said.splitlines()) == 1 and "LPIPS is left out: " in said
+    assert "LPIPS" not in said
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    assert "pip install 'splat-landscape[lpips]'" in " ".join(capsys.readouterr().out.split())
     for part in (metrics(tmp_path / "run")[key] for key in ("train", "test")):
         assert part["lpips"] is None and all(view["lpips"] is None for view in part["views"].values())
 
