@@ -124,7 +124,8 @@ def heaviest(
         )
         if whole:
             view = objective.views[_view_with_most(sights, i)]
-            one.shape = shape(_carrier(objective, view, vector, values, mass, i), view)
+            carrier = _carrier(objective, view, vector, values, mass, i)
+            one.shape, one.view, one.outline = shape(carrier, view), view.name, carrier.outline
         found.append(one)
     return found
 

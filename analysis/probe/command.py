@@ -30,8 +30,8 @@ from analysis.probe.options import ProbeOptions
 from analysis.probe.plan import expected_seconds, seconds_of_render
 from analysis.probe.record import probe_arrays, probe_record
 from analysis.probe.settings import ProbeSettings
-from analysis.probe.summary import guess, remarks, steps_made, summary
 from analysis.probe.views import write_views
+from analysis.records.page.summary import guess, remarks, steps_made, summary
 from analysis.records.provenance import provenance_of, require_seed
 from analysis.records.records import Arrays, ProbeRecord, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
@@ -172,9 +172,11 @@ def _write(
 ) -> None:
     """Write the record, its pictures and its page into the folder."""
     objective.release()  # for the memory of the processes that draw
-    write_views(folder, objective)
+    write_views(
+        folder, objective, [end.carrier.view for end in (data.eigenvalues.max, data.eigenvalues.min) if end.carrier]
+    )
     write_with_pictures(folder, data, arrays, stages, start, drawn)
-    from analysis.records.report import write_report
+    from analysis.records.page.report import write_report
 
     write_report(folder)
 
@@ -220,7 +222,7 @@ def _expected(objective: SceneObjective, settings: ProbeSettings, further: float
 
 def conclude(data: ProbeRecord, out: Path, verbose: bool, guessed: Sequence[str]) -> None:
     """Print the summary (verbose: and the tables), what failed and what is not known, with remedies."""
-    from analysis.records.report import FILE as REPORT
+    from analysis.records.page.report import FILE as REPORT
 
     console = Console()
     if verbose:

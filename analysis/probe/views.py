@@ -1,5 +1,6 @@
 """Pictures of the training views for the report: photograph and render, as JPEG in the record's folder."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,11 @@ MOST = 12  # views, spread evenly over all of them
 WIDEST, QUALITY = 800, 88  # pixels; of JPEG
 
 
-def write_views(folder: Path, objective: SceneObjective) -> None:
-    """Write the pictures of at most MOST of this process's views."""
+def write_views(folder: Path, objective: SceneObjective, named: Collection[str] = ()) -> None:
+    """Write the pictures of at most MOST of this process's views, and of those that are named."""
     count = len(objective.views)
-    for index in sorted({round(i) for i in np.linspace(0, count - 1, min(MOST, count))}):
+    spread = {round(i) for i in np.linspace(0, count - 1, min(MOST, count))}
+    for index in sorted(spread | {i for i, view in enumerate(objective.views) if view.name in named}):
         view = objective.views[index]
         image = render(objective.active, view.camera, objective.background, objective.settings).image
         for name, picture in ((PHOTOGRAPH, view.image), (RENDER, image)):

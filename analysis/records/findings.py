@@ -63,10 +63,9 @@ def findings(data: ProbeRecord) -> list[Line]:
     return sorted(lines, key=lambda line: line.level != "failure")
 
 
-def headline(data: ProbeRecord) -> list[Line]:
-    """Three sentences at most: the signs of curvature, the attribute that carries the curvature, the steepest direction."""
-    found = [*_of_ends(data), *_of_traces(data)[:1], *_of_needles(data.eigenvalues.max.lives_on, data.counts)]
-    return found[:3]
+def on_top(data: ProbeRecord) -> list[Line]:
+    """Sentences on what a summary says too."""
+    return [*of_checks(data.checks), *_of_traces(data), *_of_ends(data)]
 
 
 def of_checks(checks: Mapping[str, Check]) -> list[Line]:

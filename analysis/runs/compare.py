@@ -23,9 +23,9 @@ from analysis.console.drawing import draw
 from analysis.console.plain import say
 from analysis.records.findings import of_budgets, of_checks, unresolved
 from analysis.records.json_files import json_text, plain
+from analysis.records.page.report import pictures_in, template_environment
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, read_record
-from analysis.records.report import pictures_in, template_environment
 from analysis.records.run_files import COMPARISON, Comparison
 from analysis.runs.compare_table import Row, Run, compare_table, comparison, frame
 from analysis.runs.compared import checkpoint_path, compared, probe, probe_command, probe_folder, probed, scores_of

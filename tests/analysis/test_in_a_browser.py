@@ -17,7 +17,7 @@ from analysis.commands.view.page import offline_page
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.training.origin.fingerprint import Fingerprint
-from tests.analysis.records.test_report import with_views
+from tests.analysis.records.test_report import carried, with_views
 from tests.browser import chromium, errors_in, requests_of, until
 from tests.waiting import PATIENCE
 
@@ -44,6 +44,19 @@ def test_the_report_draws_moves_and_asks_for_nothing(browser, tmp_path):
     assert until(browser, "document.querySelector('#views img').alt.endsWith('b.png')")
     assert until(browser, "document.querySelectorAll('#views img')[1].naturalWidth") == 8
     assert errors_in(browser) == [] and requests_of(browser) == [path.as_uri()]
+
+
+@pytest.mark.parametrize("width", [420, 1280])
+def test_nothing_of_the_page_is_cut_or_scrolls_sideways(browser, tmp_path, width):
+    path = with_views(tmp_path / "probe", ["a.png", "b.png"], carried("a.png"))
+    screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    browser.get(path.as_uri())
+    browser.execute_script("document.querySelectorAll('details').forEach(each => each.open = true)")
+    beyond = "[...document.body.querySelectorAll('*')].filter(each => !each.closest('.scroll, #guard, svg')"
+    beyond += " && each.getBoundingClientRect().right > innerWidth + 1).map(each => each.outerHTML.slice(0, 80))"
+    assert browser.execute_script(f"return [document.documentElement.scrollWidth <= {width}, {beyond}]") == [True, []]
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_the_wheel_scrolls_the_page_until_the_surface_was_clicked(browser, tmp_path):

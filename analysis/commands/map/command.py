@@ -94,7 +94,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         data.timing = {**stages.timing, "total": perf_counter() - start}
         _write(folder, data)
     if found.ends:
-        from analysis.records.report import write_report  # slow to import
+        from analysis.records.page.report import write_report  # slow to import
 
         write_report(probe)  # its page shows the map's pictures
     _conclude(data, first, found.kinds[options.shown], out)

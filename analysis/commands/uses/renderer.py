@@ -30,9 +30,9 @@ from analysis.probe.command import CHECK_FAILED, conclude, probe_settings, run_p
 from analysis.probe.measurement import RISE, plane_of
 from analysis.probe.options import ProbeOptions
 from analysis.records import schema
+from analysis.records.page.report import write_report
 from analysis.records.provenance import provenance, require_seed
 from analysis.records.records import Arrays, Check, Counts, ProbeRecord, record_folder
-from analysis.records.report import write_report
 from landscape import RendererHessian, check_renderer, gauss_newton_traces, renderer_eigenpairs, spectral_density
 from landscape.eigen.pairs import EigenEnds, Eigenpairs
 from landscape.errors import InputError

@@ -7,7 +7,7 @@ is visible; the panel switches by the tree.
 from pathlib import Path
 
 from analysis.commands.view.viewer import APPEARANCE, Viewer
-from analysis.records.report import template_environment
+from analysis.records.page.report import template_environment
 
 OFFLINE = ("largest", "trace_means", "trace_quats", "split", "condition", "one_view", "order_gap")
 

@@ -24,8 +24,8 @@ from analysis.measures.per_attribute import (
     quotient,
 )
 from analysis.measures.split_control import split_in_two
+from analysis.records.page.report import render_report
 from analysis.records.records import ProbeRecord, Record, read_record
-from analysis.records.report import render_report
 from analysis.records.schema import INDICES, End, Index
 from analysis.records.tables import Cell, family_lines, family_table
 from landscape import (

@@ -17,8 +17,8 @@ from analysis.probe.command import run_probe
 from analysis.probe.measurement import STAGES
 from analysis.probe.options import ProbeOptions
 from analysis.probe.settings import ProbeSettings
-from analysis.probe.summary import summary
 from analysis.records.json_files import plain
+from analysis.records.page.summary import summary
 from analysis.records.quantities import measured
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.schema import INDICES

@@ -1,4 +1,4 @@
-"""What a record is said to show: sentences, five numbers, and the summary on a terminal."""
+"""What a record is said to show: sentences, and the summary on a terminal."""
 
 import json
 from io import StringIO
@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from analysis.probe.summary import summary
 from analysis.records.findings import findings
-from analysis.records.report import numbers
+from analysis.records.page.summary import summary
 from analysis.records.tables import family_table, probe_table
 from tests.recorded import depth_section, probe_of, soft, synthetic
 
@@ -23,23 +22,6 @@ def estimated(value: float, error: float) -> dict[str, float]:
     return {"value": value, "standard_error": error, "low": value - 2 * error, "high": value + 2 * error}
 
 
-def test_the_five_numbers_carry_their_errors_and_one_without_bracket_is_none():
-    data, _ = synthetic()
-    found = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
-    assert found["largest curvature, λ max, per stored unit²"] == "3.10 × 10⁴"
-    assert found["most negative curvature, λ min, per stored unit²"] == "−220 ± 3"
-    assert found["trace of position, the largest of five in their own units"] == "(3.99 ± 0.09) × 10⁵"
-    assert found["λ max / |λ min|, of opposite signs"] == "141 ± 2"
-    data["anisotropy"]["eigenvalue_ratio"] |= {"value": -361.0, "low": 0.0, "high": None}
-    found = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
-    assert [value for words, value in found.items() if words.startswith("λ max / |λ min|")] == ["–"]
-    data["eigenvalues"]["min"] |= {"value": 5.0}
-    data["anisotropy"]["eigenvalue_ratio"] |= {"value": 6200.0, "low": 3900.0, "high": 15500.0}
-    found = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
-    assert found["smallest curvature, λ min, per stored unit²"] == "5.0 ± 3.0"
-    assert found["λ max / λ min (3900 … 1.55 × 10⁴)"] == "6200"
-
-
 def test_attributes_are_compared_by_the_optimisers_steps_where_their_intervals_are_apart():
     data, _ = synthetic()
     assert "optimiser" not in sentences(data)  # the record has no steps
@@ -48,8 +30,6 @@ def test_attributes_are_compared_by_the_optimisers_steps_where_their_intervals_a
     said, factor = sentences(data), 400 * data["traces"]["log_scales"]["value"] / data["traces"]["means"]["value"]
     expected = f"a random step in log scale, as long as the optimiser's first, changes the loss {factor:.2g} times"
     assert f"{expected} as much as one in position, the next." in said and "all absolute traces" not in said
-    tiles = {soft(each["words"]): soft(each["value"]) for each in numbers(probe_of(data))}
-    assert tiles["the change of the loss by a step of the optimiser: log scale over position"] == f"{factor:.2g} : 1"
     whole = data["traces"]["log_scales"]
     data["traces"]["log_scales"] = whole | {"views_error": None}  # one of several views was measured
     assert "optimiser" not in sentences(data)
@@ -159,8 +139,6 @@ def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, found,
     assert lines["negative"].endswith(f"{who}{other}; {said}")
     assert found in sentences(data) and "λ max / λ min" not in str(lines)
     assert ("times as curved as the steepest up" in sentences(data)) == (confirmed is True)
-    tiles = [each["words"] for each in numbers(probe_of(data))]
-    assert any(words.startswith("λ max / |λ min|") for words in tiles) == (confirmed is True)
 
 
 @pytest.mark.parametrize(

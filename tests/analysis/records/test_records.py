@@ -310,7 +310,7 @@ def test_a_newer_format_is_refused_with_what_to_do(tmp_path):
 
 
 def test_records_reports_and_figures_need_no_torch():
-    program = "import sys, analysis.records.report, figures.make_all; sys.exit('torch' in sys.modules)"
+    program = "import sys, analysis.records.page.report, figures.make_all; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 

@@ -6,20 +6,19 @@ from collections.abc import Callable
 from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
 
-from analysis.probe.summary import summary
-from analysis.records import report
 from analysis.records.findings import findings
 from analysis.records.json_files import plain
+from analysis.records.page.report import interactive_surface, write_report
+from analysis.records.page.summary import summary
 from analysis.records.quantities import exponent_of
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
-from analysis.records.report import interactive_surface, write_report
 from analysis.records.tables import probe_table
 from figures.eye import eye_over
 from splat.training.origin.fingerprint import Fingerprint, ViewData
@@ -123,12 +122,8 @@ def test_the_map_beside_the_record_says_where_if_it_is_of_the_same(tmp_path, oth
     assert (
         "standard deviations 0.400, 0.0200, 0.0100 world units, opacity 0.70, 41 : 1 in the picture" in said
     ) == here
-    assert ("Renders do not confirm its negative end" in said) == ("; not confirmed by renders" in said) == here
-    assert ("; by renders 0.500 to 1.90 times that, by the length of the step" in said) == here
     assert (said.count("Not confirmed by renders.") == 1) == here
     assert (said.count("80% of e₁ turns Gaussian 3,778.") == 1) == here == ("Position: half" in said)
-    (headline,) = re.findall(r'<ul class="headline">(.*?)</ul>', text, re.DOTALL)
-    assert ("80% of e₁" in headline.split("<li")[-1]) == here  # the third sentence is the map's
 
 
 def _without_error(folder: Path) -> None:
@@ -180,9 +175,30 @@ def test_a_damaged_map_costs_the_page_its_pictures_alone_and_is_said(tmp_path, d
     assert "The map is left out: expected" in Page(text).text
 
 
-def test_photograph_and_render_of_the_training_views_come_first(tmp_path):
+def carried(view: str) -> dict[str, Any]:
+    """A record whose steepest direction one Gaussian carries, in a view of 8 x 6 px."""
+    data, _ = synthetic()
+    data["objective"]["sizes"] = [[8, 6]]
+    found = {"gaussian": 3778, "share": 0.8, "attribute": "quats", "view": view, "outline": [2.0, 1.0, 2.0, 0.5, 0.5]}
+    data["eigenvalues"]["max"]["carrier"] = found
+    return data
+
+
+def test_the_page_opens_with_the_gaussian_that_carries_the_steepest_direction_then_the_summary(tmp_path):
+    names = ["a.png", "b <i>.png", "c.png"]
+    text = with_views(tmp_path / "several", names, carried("b <i>.png")).read_text(encoding="utf-8")
+    order = [text.index(each) for each in ("<svg", "<dt>scene", "<dt>steepest", 'id="views"')]
+    assert order == sorted(order) and re.findall(r'viewBox="([^"]*)"', text) == ["0 0 8 6", "0 0 8 6"]
+    assert text.count('<ellipse cx="2.0" cy="1.0" rx="2.0" ry="2.0" transform="rotate(28.6') == 2
+    assert 'id="name">2 of 3: b &lt;i&gt;.png<' in text and 'value="1" aria-label' in text
+    data = carried("a.png")
+    data["checks"]["symmetry"] |= {"value": 0.5, "passed": False}
+    assert "<svg" not in with_views(tmp_path / "doubtful", names, data).read_text(encoding="utf-8")
+    assert "<svg" not in with_views(tmp_path / "elsewhere", names, carried("d.png")).read_text(encoding="utf-8")
+
+
+def test_photograph_and_render_of_the_training_views_are_on_the_page(tmp_path):
     text = with_views(tmp_path / "several", ["a.png", "b <i>.png", "c.png"]).read_text(encoding="utf-8")
-    assert text.index('class="views"') < text.index('class="numbers"') < text.index('class="headline"')
     assert text.count("data:image/jpeg") == 2 * 3 and 'type="range"' in text and "<i>" not in text
     alone = with_views(tmp_path / "one", ["a.png"]).read_text(encoding="utf-8")
     assert alone.count("data:image/jpeg") == 2 and 'type="range"' not in alone
@@ -342,22 +358,12 @@ def test_the_page_of_the_splats_is_linked_where_it_is(tmp_path):
 def test_the_title_and_the_checks_say_what_is_known(tmp_path):
     data, arrays = synthetic()
     text = Page(page(tmp_path / "whole", data, arrays)).text
-    assert "Loss landscape of fern, 3 views, 2,000 steps" in text and "Checks: 2 of 3 passed, 1 could not run." in text
+    assert (
+        "Loss landscape of fern, 3 views, 2,000 steps" in text
+        and "checks 2 of 3 passed, not finite difference; 45 s" in text
+    )
     del data["provenance"]["scene"], data["provenance"]["iteration"]
     data["counts"] |= {"views": 1}
     data["checks"] = {"symmetry": data["checks"]["symmetry"]}
     text = Page(page(tmp_path / "less", data, arrays)).text
-    assert "Loss landscape of a checkpoint, 1 view " in text and "Checks: 1 of 1 passed." in text
-
-
-def test_the_first_view_is_that_of_the_steepest_direction(tmp_path, monkeypatch):
-    path = with_views(tmp_path / "probe", ["a.png", "b.png", "c.png"])
-    assert 'id="name">1 of 3: a.png<' in path.read_text(encoding="utf-8")
-    steepest = SimpleNamespace(
-        view="b.png", sentence="most of e₁ in b.png", curvature=1.0, is_refuted=False, factors=[]
-    )
-    found = SimpleNamespace(steepest=[steepest], panels=[])
-    monkeypatch.setattr(report, "map_beside", lambda record: found)
-    monkeypatch.setattr(report, "map_pictures", lambda *_: [])
-    text = write_report(path.parent).read_text(encoding="utf-8")
-    assert 'id="name">2 of 3: b.png<' in text and 'value="1" aria-label' in text
+    assert "Loss landscape of a checkpoint, 1 view " in text and "checks all 1 passed; 45 s" in text

@@ -1,4 +1,4 @@
-"""A self-contained page about one record: the scene, five numbers and three sentences; the pictures; every number, folded.
+"""A self-contained page about one record: where the curvature is, the summary, the pictures, and every number, folded.
 
 The page carries its pictures and plotly.js (compressed) within it, and its content security policy forbids every request
 to a network.  Text from the record is escaped.
@@ -20,24 +20,15 @@ import jinja2
 import numpy as np
 from PIL import Image
 
-from analysis.records.findings import (
-    Line,
-    attribute_name,
-    findings,
-    headline,
-    is_loose,
-    is_open,
-    largest_steps,
-    shares_per_trace,
-    trace_values,
-)
+from analysis.records.findings import Line, attribute_name, findings, is_loose, on_top, shares_per_trace
 from analysis.records.json_files import plain
+from analysis.records.page.summary import told
 from analysis.records.provenance import Provenance
-from analysis.records.quantities import exponent_of, limits, measured, percent, quantity, ratio, rough, unit_suffix
+from analysis.records.quantities import exponent_of, limits, measured, percent, quantity, ratio, unit_suffix
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map, read_maps
 from analysis.records.schema import INDICES
-from analysis.records.tables import bracketed, family_lines
+from analysis.records.tables import family_lines
 from figures.eye import eye_over
 from landscape.errors import InputError
 from splat.model.untrusted import read_picture, write_atomically
@@ -59,6 +50,7 @@ COMPARED = (  # of the traces, where the record has these steps
     "compares; beside the names their traces, each in its own unit."
 )
 PIXEL = "1 px along the ray: a way as long as the one that moves a splat by a pixel where it is across the ray."
+ROOM, SMALLEST = 3.0, 6  # of the part around an outline: in its half length; at least 1 / SMALLEST of the picture
 PACKED = 4  # level of gzip of plotly.js: at the usual 6 it takes twice as long for 4% fewer bytes
 
 
@@ -108,14 +100,15 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
     """Pictures and plotly.js are compressed in parallel."""
     data, run = record.data, record.folder.parent
     surface = interactive_surface(record)
-    first = opening(data, mapped)
+    lines = told(data)
     captions = PICTURES | ({"traces": COMPARED} if shares_per_trace(data) else {})
     with ThreadPoolExecutor() as pool:
         packed = pool.submit(_packed_plotly) if surface else None
         pictures = pool.submit(pictures_in, record.folder, captions, shown_numbers(record))
-        places = pool.submit(map_pictures, run / MAP, mapped, first[-1].text)
+        places = pool.submit(map_pictures, run / MAP, mapped)
         views = views_in(record, mapped)
-    start = first_view(mapped, views)
+    end = data.eigenvalues.max.carrier
+    start = next((i for i, view in enumerate(views) if end and view["name"] == end.view), 0)
     listed = list(views)
     if views:  # the pictures of this view are in the page once, as images; the script reads them from there
         listed[start] = views[start] | {"pictures": [each | {"uri": ""} for each in views[start]["pictures"]]}
@@ -125,14 +118,14 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
         counts=plain(data.counts),
         provenance=_told(data.provenance),
         subtitle=subtitle(data),
-        numbers=numbers(data, mapped),
-        headline=first,
+        lines=lines,
+        place=place_of(record, views) if "steepest" in lines else None,
         findings=said,
+        facts=[line for line in said if line.level == "fact" and line not in on_top(data)],
         views=views,
         listed_views=listed,
         start=start,
         title=title(data),
-        checks=passed(data),
         pictures=pictures.result(),
         where=places.result(),
         splats=f"../{SPLATS}" if (run / SPLATS).is_file() else "",
@@ -158,28 +151,25 @@ def title(data: ProbeRecord) -> str:
     return ", ".join(parts + ([] if steps is None else [f"{steps:,} steps"]))
 
 
-def passed(data: ProbeRecord) -> str:
-    """How many self-checks passed, and how many could not run, in words; empty without checks."""
-    results = [check.passed for check in data.checks.values()]
-    text = f"{sum(map(bool, results))} of {len(results)} passed" if results else ""
-    return text + (f", {missing} could not run" if (missing := results.count(None)) else "")
+def place_of(record: Record[ProbeRecord], views: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Where the steepest direction is: the Gaussian that carries it, outlined in the view where it has most weight.
 
-
-def first_view(mapped: MapRecord | None, views: list[dict[str, Any]]) -> int:
-    """Index of the view that the opening names, else 0."""
-    named = mapped.steepest[0].view if mapped and mapped.steepest else None
-    return next((i for i, view in enumerate(views) if view["name"] == named), 0)
-
-
-def opening(data: ProbeRecord, mapped: MapRecord | None) -> list[Line]:
-    """The three sentences at the top.  The last is the map's on the steepest direction, where there is one."""
-    lines = headline(data)
-    if mapped is None or not mapped.steepest:
-        return lines
-    if any(end.curvature < 0 and end.is_refuted for end in mapped.steepest):
-        refuted = "Renders do not confirm its negative end: the loss rises along it at every length that was tried."
-        lines[0] = Line(f"{lines[0].text} {refuted}", lines[0].level)
-    return [*lines[:2], Line(mapped.steepest[0].sentence)]
+    "view": of `views`; "ellipse" and its "angle", degrees, in px of the photograph; "boxes": of the whole photograph and of a
+    part.  None where it is not known.
+    """
+    carrier, sizes = record.data.eigenvalues.max.carrier, record.data.objective.sizes
+    names = record.data.provenance.views or []
+    if not (carrier and len(carrier.outline) == 5 and sizes and carrier.view in names):
+        return None
+    view = next((each for each in views if each["name"] == carrier.view), None)
+    width, height = sizes[min(names.index(carrier.view), len(sizes) - 1)]
+    x, y, long, short, angle = carrier.outline
+    side = min(max(ROOM * long, height / SMALLEST), height)  # high; as wide as the photograph is to its height
+    wide = side * width / height
+    left, top = (min(max(at - size / 2, 0), most - size) for at, size, most in ((x, wide, width), (y, side, height)))
+    boxes = [(0, 0, width, height), (round(left), round(top), round(wide), round(side))]
+    ellipse = {"cx": x, "cy": y, "rx": max(long, 2.0), "ry": max(short, 2.0)}
+    return view and {"view": view, "ellipse": ellipse, "angle": math.degrees(angle), "boxes": boxes}
 
 
 def subtitle(data: ProbeRecord) -> str:
@@ -192,49 +182,6 @@ def subtitle(data: ProbeRecord) -> str:
     if loss.gradient_norm is not None:
         parts.append(f"gradient norm {quantity(loss.gradient_norm)}")
     return ", ".join(parts) + "."
-
-
-def numbers(data: ProbeRecord, mapped: MapRecord | None = None) -> list[dict[str, str]]:
-    """The five numbers at the top: "value", with its error or bracket, and "words".  mapped: compares ends with renders."""
-    ends, found = data.eigenvalues, []
-    lowest = "most negative" if (ends.min.value or 0.0) < 0 else "smallest"
-    rendered = {each.curvature > 0: _by_renders(each) for each in (mapped.steepest if mapped else [])}
-    for end, words in ((ends.max, "largest curvature, λ max"), (ends.min, f"{lowest} curvature, λ min")):
-        compared = rendered.get((end.value or 0.0) > 0, "")
-        found.append({"value": measured(end.value, end.residual), "words": f"{words}, per stored unit²{compared}"})
-    found += _steepest_attribute(data)
-    if (index := data.anisotropy.eigenvalue_ratio) and ends.stand:
-        cell = bracketed(None if is_open(index) else index)
-        value, words = cell.value, "λ max / λ min"
-        if index.value and index.value < 0:
-            value, words = value.removeprefix("−"), "λ max / |λ min|, of opposite signs"
-        found.append({"value": value, "words": words + (f" ({cell.bracket})" if cell.bracket else "")})
-    if lives := ends.max.lives_on:
-        words = f"Gaussians carry the steepest direction, of {data.counts.visible_gaussians:,} in sight"
-        found.append({"value": quantity(lives.participation), "words": words})
-    return found
-
-
-def _by_renders(end: Steepest) -> str:
-    """Comparison of an end's curvature with renders of several steps; empty where there are none."""
-    if end.is_refuted:
-        return "; not confirmed by renders"
-    if not end.factors:
-        return ""
-    return f"; by renders {quantity(min(end.factors))} to {quantity(max(end.factors))} times that, by the length of the step"
-
-
-def _steepest_attribute(data: ProbeRecord) -> list[dict[str, str]]:
-    """The largest change of the loss by an optimiser's step over the next one, where known; else the largest trace."""
-    if steps := largest_steps(data):
-        first, second, ratio = attribute_name(steps[0]), attribute_name(steps[1]), steps[2]
-        words = f"the change of the loss by a step of the optimiser: {first} over {second}"
-        return [{"value": f"{rough(ratio)} : 1", "words": words}]
-    if not (values := trace_values(data)):
-        return []
-    name = max(values, key=lambda each: abs(values[each]))
-    words = f"trace of {attribute_name(name)}, the largest of five in their own units"
-    return [{"value": measured(values[name], data.traces[name].standard_error), "words": words}]
 
 
 def map_beside(record: Record[ProbeRecord]) -> MapRecord | None:
@@ -276,17 +223,13 @@ def views_in(record: Record[ProbeRecord], mapped: MapRecord | None) -> list[dict
     return views
 
 
-def map_pictures(folder: Path, mapped: MapRecord | None, shown: str) -> list[dict[str, str]]:
-    """Pictures of the map in a folder: "uri", "words", the "text" above and the "caption" below each.
-
-    shown: a sentence that the page has already, which no text repeats.
-    """
+def map_pictures(folder: Path, mapped: MapRecord | None) -> list[dict[str, str]]:
+    """Pictures of the map in a folder: "uri", "words", the "text" above and the "caption" below each."""
     if mapped is None:
         return []
-    rows = []
-    for end in mapped.steepest:
-        text = end.rendered if end.sentence == shown else f"{end.sentence} {end.rendered}"
-        rows.append((end.file, text, end.sentence, carriers_in_words(end)))
+    rows = [
+        (end.file, f"{end.sentence} {end.rendered}", end.sentence, carriers_in_words(end)) for end in mapped.steepest
+    ]
     fragile, named = "\n".join(mapped.sentences[len(mapped.steepest) :]), {end.view for end in mapped.steepest[:1]}
     panel = next((panel for panel in mapped.panels if panel.name in named), mapped.panels[0] if mapped.panels else None)
     words = f"{panel.name}: maps of its fragility in position, conditioning and opacity. {PIXEL}" if panel else ""
