@@ -27,7 +27,7 @@ from splat.model.untrusted import loose_json
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, explicit_split, read_names, split_scene
 from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_frame, posed, shift_of, shift_to_origin
-from splat.training.origin.likeness import Photographs, Reading, mistaken
+from splat.training.origin.likeness import Photographs, Reading
 from splat.training.origin.options import Foreign
 from splat.training.origin.presets import PRESETS, Preset, World, preset_of, render_of
 from splat.training.origin.scene_reference import SceneReference
@@ -66,7 +66,7 @@ def foreign_training(
     names = [split.train[i * len(split.train) // GUARDED] for i in range(min(GUARDED, len(split.train)))]
     photographs = Photographs(scene, names, config, centred=preset.centred)
     found_in = partial(_readings, found, scene, path)
-    reading = photographs.best(found_in(preset.world), lambda best: _mistaken(best, preset.world, found_in))
+    reading = photographs.best(found_in(preset.world), _elsewhere(preset.world, found_in))
     level = photographs.require(reading, picture)
     similarity = reading.similarity
     reference = replace(reference, similarity=similarity, centred=preset.centred)
@@ -217,9 +217,8 @@ def _readings(found: SplatFile, scene: Scene, path: Path, kind: World) -> Iterat
             yield Reading(_near(gaussians, world) if kind == "scene" else gaussians, world, notes)
 
 
-def _mistaken(best: Reading, kind: World, found_in: Callable[[World], Iterator[Reading]]) -> Iterator[Reading]:
-    """What another writer, or one with another world than that of this kind, would have meant."""
-    yield from mistaken(best)
+def _elsewhere(kind: World, found_in: Callable[[World], Iterator[Reading]]) -> Iterator[Reading]:
+    """What a preset with another world than that of this kind would have meant."""
     for other, name in WORLDS.items():
         with suppress(InputError):  # the scene has no such world
             for each in found_in(other) if other != kind else ():

@@ -10,8 +10,9 @@ training views and at most 0.24 dB on others; after 1,000 steps right readings o
 order of colours in a grey scene.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from math import inf, isfinite, isnan
 from operator import itemgetter
 from pathlib import Path
@@ -83,13 +84,15 @@ class Photographs:
         self.views = scene.load(names)
         self.small = [_small(view) for view in self.views]
 
-    def best(self, readings: Iterable[Reading], others: Callable[[Reading], Iterable[Reading]]) -> Reading:
+    def best(self, readings: Iterable[Reading], elsewhere: Iterable[Reading]) -> Reading:
         """The one that looks most like the photographs.
 
-        others: the mistaken readings beside it.  InputError where one of them looks clearly better, and like the scene.
+        elsewhere: mistaken readings in other worlds, where nothing looks like a scene, and which then alone are tried.
+        InputError where a mistaken reading looks clearly better, and like the scene.
         """
         own, best = max(((self.on_small(each), each) for each in readings), key=itemgetter(0))
-        level, other = max(((self.on_small(each), each) for each in others(best)), key=itemgetter(0))
+        others = chain(mistaken(best), elsewhere if own < least(self.small) else ())
+        level, other = max(((self.on_small(each), each) for each in others), key=itemgetter(0))
         if level > own + CLEARLY and level >= least(self.small):
             before = f"{own:.1f}" if isfinite(own) else "no picture"
             raise InputError(
