@@ -99,7 +99,8 @@ def _run(
             deadline=begun + limit - DRAWING, population=checkpoint.all_views, ranks=ranks or ALONE,
         )  # fmt: skip
         origin = provenance_of(made, subject, command)
-        data, arrays = probe_record(found, objective, origin, stages.timing), probe_arrays(found)
+        data = probe_record(found, objective, origin, stages.timing)
+        arrays = probe_arrays(found.traces, found.ends, found.density, found.plane)
         data.steps = lengths
         if families is not None:
             data = _with_families(data, arrays, families, objective, checkpoint, generator, stages, found.ends)

@@ -40,7 +40,7 @@ def probe_record(
     of_loss = UNSET if left_out is None else sampling_error(left_out.losses, left_out.population)
     return ProbeRecord(
         objective=objective_of(objective, found.value, found.gradient_norm, of_loss),
-        traces={name: _trace(trace, left_out, seen.get(name)) for name, trace in found.traces.items()},
+        traces={name: trace_record(trace, left_out, seen.get(name)) for name, trace in found.traces.items()},
         eigenvalues=_eigenvalues(found, objective),
         anisotropy=anisotropy_record(found.ends, found.density, found.power),
         concentration=concentration_record(found.density),
@@ -61,14 +61,10 @@ def probe_record(
     )
 
 
-def probe_arrays(found: Measured) -> dict[str, dict[str, np.ndarray]]:
-    """The arrays, by file (`analysis.records.records.ARRAYS`)."""
-    return arrays_of(found.traces, found.ends, found.density, found.plane)
-
-
-def arrays_of(
+def probe_arrays(
     traces: Mapping[str, TraceEstimate], ends: EigenEnds, density: SpectralDensity | None, plane: PlaneSlice | None
 ) -> dict[str, dict[str, np.ndarray]]:
+    """The arrays, by file (`analysis.records.records.ARRAYS`)."""
     assert ends.ritz is not None
     values, residuals = ends.ritz.numpy()
     arrays = {
@@ -100,10 +96,11 @@ def index_of(bracket: Bracket) -> schema.Index:
     return convert(bracket.record(), schema.Index)
 
 
-def _trace(trace: TraceEstimate, left_out: LeftOut | None, rank: int | None) -> schema.Trace:
+def trace_record(trace: TraceEstimate, left_out: LeftOut | None = None, rank: int | None = None) -> schema.Trace:
     """rank: of the block, where it is below its size: for colours, the directions that some view sees."""
     numbers = {**trace.record(), **({} if rank is None else {"dim": rank})}
     method = "exact, the coupling of pixels sampled with random signs" if numbers["probes"] else "exact"
+    method = "Gauss-Newton, by backward passes" if trace.method == "pixels" else method
     tau = curvature_scale(numbers["value"] or 0.0, numbers["dim"], 1, "active")
     found = convert({**numbers, "tau": tau, "method": method}, schema.Trace)
     found.views_error = UNSET if left_out is None else trace.left_out(left_out.population)
@@ -118,23 +115,27 @@ def _block_share(found: BlockShare) -> schema.BlockShare:
     )  # fmt: skip
 
 
+def eigenvalue_record(of: EigenEnds, pairs: Eigenpairs, index: int, blocks: Mapping[str, slice]) -> schema.Eigenvalue:
+    shares = mass_shares(pairs.vectors[:, index], blocks)
+    return schema.Eigenvalue(**pairs.record(index), matvecs=of.matvecs, method=of.method, shares=shares)  # pyright: ignore[reportArgumentType]
+
+
 def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalues:
     ends, power, gaussians = found.ends, found.power, objective.active
     needles = conditions(gaussians, [view.camera for view in objective.views], objective.settings)
 
-    def eigenvalue(of: EigenEnds, pairs: Eigenpairs, index: int = 0) -> schema.Eigenvalue:
-        shares = mass_shares(pairs.vectors[:, index], gaussians.blocks)
-        return schema.Eigenvalue(**pairs.record(index), matvecs=of.matvecs, method=of.method, shares=shares)  # pyright: ignore[reportArgumentType]
-
     def exact(pairs: Eigenpairs, index: int) -> schema.Eigenvalue:
-        found_end = eigenvalue(ends, pairs, index)
+        found_end = eigenvalue_record(ends, pairs, index, gaussians.blocks)
         found_end.lives_on = localize(pairs.vectors[:, index], gaussians, needles)
         return found_end
 
     largest, smallest = ends.largest, ends.smallest
     rows = schema.Eigenvalues(max=exact(largest, 0), second=exact(largest, 1), min=exact(smallest, 0))
     if power is not None:
-        rows.power_max, rows.power_min = eigenvalue(power, power.largest), eigenvalue(power, power.smallest)
+        ends_of_power = (
+            eigenvalue_record(power, pairs, 0, gaussians.blocks) for pairs in (power.largest, power.smallest)
+        )
+        rows.power_max, rows.power_min = ends_of_power
     if found.rendered is not None:
         made = found.rendered
         rendered = zip(made.ends, made.steps, made.kinks, made.carriers, found.spreads, strict=True)

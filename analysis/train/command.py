@@ -33,7 +33,7 @@ from analysis.console.overrides import assignments, overridden
 from analysis.console.plain import say
 from analysis.records.run_files import CHECKPOINT
 from analysis.train.options import TrainOptions
-from analysis.train.progress import TrainingProgress, tracker
+from analysis.train.progress import TrainingProgress, tracker_module
 from analysis.train.remarks import begins, remarks
 from analysis.train.scores import report
 from analysis.train.source import from_checkpoint
@@ -133,7 +133,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     if options.keep_checkpoints != "all" and options.keep_checkpoints < 0:
         raise InputError(f"expected keep_checkpoints of at least 0, or all, got {options.keep_checkpoints}")
     if options.track:
-        tracker(options.track)  # refuses before anything is loaded
+        tracker_module(options.track)  # refuses before anything is loaded
     along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_quick)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)

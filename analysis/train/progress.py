@@ -10,12 +10,10 @@ loss, psnr         of the first training view as it would be rendered then: the 
 seconds, cpu       that the steps so far took, by the clock and of all processors together, without loading, saving and scoring
 """
 
-from collections.abc import Callable, Mapping
-from functools import partial
 from importlib import import_module
 from math import inf, isnan, nan
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -55,7 +53,7 @@ class TrainingProgress:
         self.training, self.view, self.every, self.console = training, view, every, console
         self.loss, self.begun = nan, (training.step, 0.0)
         self.most = inf if training.step else FAST * len(training.gaussians)  # Gaussians, before it says why
-        self.tracker = tracker(track)(run, training.step) if track else None
+        self.tracker = Tracker(track, run, training.step) if track else None
         write_atomically(run / LOG, "".join([",".join(COLUMNS) + "\n", *kept_rows(run / LOG, training.step)]).encode())
         self.file = (run / LOG).open("a", encoding="utf-8", newline="")
         self.bars = Progress(
@@ -140,54 +138,32 @@ def scored(training: Training, view: View) -> tuple[float, float]:
     return float(loss) + regularizers.value, psnr(image.to(view.image.device), view.image)
 
 
-class Tracker(Protocol):
-    """What takes the rows of a run, beginning after the step that it was made with."""
+class Tracker:
+    """Takes the rows of a run for TensorBoard (in RUN/tracked), or Weights & Biases or trackio, whose calls are the same."""
 
-    def add(self, values: Mapping[str, float], step: int) -> object: ...
-    def close(self) -> object: ...
+    def __init__(self, name: str, run: Path, step: int) -> None:
+        """step: that the run is at; what an interrupted one told TensorBoard of later ones is dropped."""
+        self.module, self.writer = tracker_module(name), None
+        if name == "tensorboard":
+            self.writer = self.module.SummaryWriter(str(run / TRACKED), purge_step=step + 1)
+        else:
+            self.module.init(project="landscape", name=run.name)
 
-
-class TensorBoard:
-    """Scalars in RUN/tracked; those of an interrupted run after its last checkpoint are dropped."""
-
-    def __init__(self, module: Any, run: Path, step: int) -> None:
-        self.writer = module.SummaryWriter(str(run / TRACKED), purge_step=step + 1)
-
-    def add(self, values: Mapping[str, float], step: int) -> None:
+    def add(self, values: dict[str, float], step: int) -> None:
+        if self.writer is None:
+            return self.module.log(values, step=step)
         for name, value in values.items():
             self.writer.add_scalar(name, value, step)
-        self.writer.flush()
+        return self.writer.flush()
 
     def close(self) -> None:
-        self.writer.close()
+        (self.module.finish if self.writer is None else self.writer.close)()
 
 
-class Remote:
-    """Weights & Biases, or trackio, whose calls are the same: a run of the project "landscape" with the name of the folder."""
-
-    def __init__(self, module: Any, run: Path, step: int) -> None:
-        self.module = module
-        module.init(project="landscape", name=run.name)
-
-    def add(self, values: Mapping[str, float], step: int) -> None:
-        self.module.log(dict(values), step=step)
-
-    def close(self) -> None:
-        self.module.finish()
-
-
-TRACKERS = {
-    "tensorboard": ("torch.utils.tensorboard", TensorBoard),
-    "wandb": ("wandb", Remote),
-    "trackio": ("trackio", Remote),
-}
-
-
-def tracker(name: str) -> Callable[[Path, int], Tracker]:
-    """Makes a tracker of a run, from the step it is at.  InputError where its package is not installed."""
-    module, kind = TRACKERS[name]
+def tracker_module(name: str) -> Any:
+    """The module of a tracker.  InputError where it is not installed."""
     try:
-        return partial(kind, import_module(module))
+        return import_module("torch.utils.tensorboard" if name == "tensorboard" else name)
     except ImportError as error:
         raise InputError(
             f"expected the package {name} for --track {name} ({error}); install it with pip install {name}, or leave the "

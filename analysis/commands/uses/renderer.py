@@ -17,14 +17,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from msgspec import UNSET, convert
+from msgspec import UNSET
 from rich.console import Console
 
 from analysis.console.drawing import Draw
 from analysis.console.plain import say
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.measures.localization import mass_shares
 from analysis.probe import record
 from analysis.probe.command import CHECK_FAILED, conclude, probe_settings, run_probe
 from analysis.probe.measurement import RISE, plane_of
@@ -34,13 +33,12 @@ from analysis.records.page.report import write_report
 from analysis.records.provenance import provenance, require_seed
 from analysis.records.records import Arrays, Check, Counts, ProbeRecord, record_folder
 from landscape import RendererHessian, check_renderer, gauss_newton_traces, renderer_eigenpairs, spectral_density
-from landscape.eigen.pairs import EigenEnds, Eigenpairs
+from landscape.eigen.pairs import Eigenpairs
 from landscape.errors import InputError
 from landscape.operators.renderer.check import UNRESOLVED, WRONG
 from landscape.slices.finite_probe import finite_probe
 from landscape.slices.slices import curvature_reach
 from landscape.traces.pixels import gauss_newton_blocks
-from splat.curvature.traces import curvature_scale
 
 NAMED = re.compile(r"(.+\.py):([^\W\d]\w*)")
 UNUSED = ("device", "loss", "seconds", "power", "per_attribute", "split_control", "metric", "memory", "foreign")
@@ -118,14 +116,18 @@ def _measured(hessian: RendererHessian, options: ProbeOptions, stages: Stages) -
     if settings.density_matvecs:
         with stages.stage("density") as report:
             density = spectral_density(hessian, generator, settings.density_matvecs, ends=ends, progress=report)
-    arrays = record.arrays_of(traces, ends, density, plane)
+    arrays = record.probe_arrays(traces, ends, density, plane)
     if POSITIONS in hessian.blocks and hessian.parameters.tensors[0].shape[1:] == (3,):
         arrays["places"] = _places(hessian, generator)
+    found = [(ends.largest, 0), (ends.largest, 1), (ends.smallest, 0)]
+    rows = [record.eigenvalue_record(ends, pairs, index, hessian.blocks) for pairs, index in found]
+    for row, probe in zip((rows[0], rows[2]), probes, strict=True):
+        row.renders = UNSET if probe is None else record.renders_record(probe)
     off = max((abs(ratio) - 2 * spread for ratio, spread in check.gradients.values()), default=0.0)
     return ProbeRecord(
         objective=schema.Objective(operator="hessian", value=hessian.value, gradient_norm=float(hessian.gradient.norm())),
-        traces={name: _trace(trace.record()) for name, trace in traces.items()},
-        eigenvalues=_ends(hessian, ends, probes),
+        traces={name: record.trace_record(trace) for name, trace in traces.items()},
+        eigenvalues=schema.Eigenvalues(max=rows[0], second=rows[1], min=rows[2]),
         anisotropy=record.anisotropy_record(ends, density),
         concentration=record.concentration_record(density),
         finite_probe=probes[0] and record.finite_record(probes[0]),
@@ -151,23 +153,6 @@ def _along(hessian: RendererHessian, pairs: Eigenpairs) -> Any:
     reach = curvature_reach(value, RISE * hessian.value)
     steps = [reach / 2**k for k in range(HALVINGS, -1, -1)]
     return finite_probe(hessian.loss_at, hessian.point, pairs.vectors[:, 0], hessian, steps)
-
-
-def _trace(numbers: dict[str, Any]) -> schema.Trace:
-    tau = curvature_scale(numbers["value"], numbers["dim"], 1, "active")
-    return convert({**numbers, "tau": tau, "method": "Gauss-Newton, by backward passes"}, schema.Trace)
-
-
-def _ends(hessian: RendererHessian, ends: EigenEnds, probes: Sequence[Any]) -> schema.Eigenvalues:
-    def end(pairs: Eigenpairs, index: int, probe: Any = None) -> schema.Eigenvalue:
-        shares = mass_shares(pairs.vectors[:, index], hessian.blocks)
-        found = schema.Eigenvalue(**pairs.record(index), matvecs=ends.matvecs, method=ends.method, shares=shares)  # pyright: ignore[reportArgumentType]
-        found.renders = UNSET if probe is None else record.renders_record(probe)
-        return found
-
-    return schema.Eigenvalues(
-        max=end(ends.largest, 0, probes[0]), second=end(ends.largest, 1), min=end(ends.smallest, 0, probes[1])
-    )
 
 
 def _places(hessian: RendererHessian, generator: torch.Generator) -> dict[str, np.ndarray]:

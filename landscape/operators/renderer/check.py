@@ -10,7 +10,6 @@ What makes products meaningless is refused when the operator is made: a NaN, ano
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +17,6 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.operators.renderer.renderer import RendererHessian
 from landscape.probes import draw_probes
-from landscape.results import plain
 
 WRONG = 0.03  # of a gradient: on splats the estimate of a right one was off by 0.01 at most
 JUMPS = 0.2  # share of the change of an image in pixels that jump: larger ones are worth a sentence
@@ -68,15 +66,6 @@ class RendererCheck:
                 "use the traces by backward passes alone (gauss_newton_traces)"
             )
         return found
-
-    @property
-    def passed(self) -> bool:
-        return not self.sentences
-
-    def record(self) -> dict[str, Any]:
-        return plain(self, "deterministic noise kinks unseen error passed") | {
-            "gradients": {name: list(pair) for name, pair in self.gradients.items()}
-        }
 
 
 def check_renderer(hessian: RendererHessian, generator: torch.Generator) -> RendererCheck:

@@ -42,14 +42,11 @@ def graphdeco_hessian(
     >>> from splat import Gaussians, SyntheticSettings, synthetic_scene
     >>> from splat.render.render import render as ours
     >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
-    >>> leaves = {name: value.clone().requires_grad_() for name, value in made.truth.attributes.items()}
-    >>> leaves |= {"dc": made.truth.sh[:, :1].clone(), "rest": made.truth.sh[:, 1:].clone()}
-    >>> of_theirs = dict(_xyz="means", _scaling="log_scales", _rotation="quats", _opacity="opacity_logits",
-    ...                  _features_dc="dc", _features_rest="rest")
-    >>> model = SimpleNamespace(**{theirs: leaves[name].requires_grad_() for theirs, name in of_theirs.items()})
+    >>> parts = made.truth.attributes | {"sh/dc": made.truth.sh[:, :1], "sh/rest": made.truth.sh[:, 1:]}
+    >>> model = SimpleNamespace(**{STORED[name]: parts[name].clone().requires_grad_() for name in STORED})
     >>> def theirs(camera, pc, pipe, bg_color):
-    ...     sh = torch.cat([pc._features_dc, pc._features_rest], dim=1)
-    ...     parts = dict(means=pc._xyz, log_scales=pc._scaling, quats=pc._rotation, opacity_logits=pc._opacity, sh=sh)
+    ...     parts = {name: getattr(pc, attribute) for name, attribute in STORED.items()}
+    ...     parts["sh"] = torch.cat([parts.pop("sh/dc"), parts.pop("sh/rest")], dim=1)
     ...     return {"render": ours(Gaussians.pack(parts), camera.camera, bg_color).image}
     >>> cameras = [SimpleNamespace(camera=view.camera, original_image=view.image + 0.1) for view in made.scene.load()]
     >>> H = graphdeco_hessian(theirs, model, None, torch.zeros(3), cameras)
@@ -57,12 +54,15 @@ def graphdeco_hessian(
     (['means', 'log_scales', 'quats', 'opacity_logits', 'sh'], tensor(True))
     """
     named = {name: getattr(gaussians, attribute) for name, attribute in STORED.items()}
+    return RendererHessian(
+        lambda camera: render(camera, gaussians, pipe, background)["render"],
+        {name: value for name, value in named.items() if value.numel()},
+        lambda image, camera: exact_loss(image, camera.original_image, loss),
+        cameras,
+    )
 
-    def image_of(camera: Any) -> Tensor:
-        return render(camera, gaussians, pipe, background)["render"]
 
-    def loss_of(image: Tensor, camera: Any) -> Tensor:
-        exact = image.double()
-        return view_loss(exact, backend_of(exact).view_loss(camera.original_image.to(exact.device), loss, exact))
-
-    return RendererHessian(image_of, {name: value for name, value in named.items() if value.numel()}, loss_of, cameras)
+def exact_loss(image: Tensor, target: Tensor, loss: LossSettings) -> Tensor:
+    """The loss of an image (3, h, w) in float64."""
+    exact = image.double()
+    return view_loss(exact, backend_of(exact).view_loss(target.to(exact.device), loss, exact))

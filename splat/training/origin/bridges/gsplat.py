@@ -15,9 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape import RendererHessian
-from splat.losses.autograd import view_loss
 from splat.losses.reference import LossSettings
-from splat.render.backend import backend_of
+from splat.training.origin.bridges.graphdeco import exact_loss
 
 STORED = {
     "means": "means",
@@ -47,10 +46,9 @@ def gsplat_hessian(
     >>> from splat import Gaussians, SyntheticSettings, synthetic_scene
     >>> from splat.render.render import render
     >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
-    >>> views, stored = made.scene.load(), made.truth.attributes
-    >>> parts = {"means": stored["means"], "scales": stored["log_scales"], "quats": stored["quats"], "opacities":
-    ...          stored["opacity_logits"], "sh0": stored["sh"][:, :1], "shN": stored["sh"][:, 1:]}
-    >>> splats = torch.nn.ParameterDict({name: value.clone() for name, value in parts.items()})
+    >>> views, parts = made.scene.load(), made.truth.attributes
+    >>> parts |= {"sh/dc": parts["sh"][:, :1], "sh/rest": parts["sh"][:, 1:]}
+    >>> splats = torch.nn.ParameterDict({key: parts[name].clone() for name, key in STORED.items()})
     >>> def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree):  # stands for theirs
     ...     parts = dict(means=means, quats=quats, log_scales=scales.log(), opacity_logits=opacities.logit(), sh=colors)
     ...     image = render(Gaussians.pack(parts), views[int(viewmats[0, 0, 0])].camera).image
@@ -66,23 +64,15 @@ def gsplat_hessian(
 
     def image_of(index: int) -> Tensor:
         height, width, _ = images[index].shape
+        stored = {name: splats[name] for name in ("means", "quats")} | {"width": width, "height": height}
         found = rasterization(
-            means=splats["means"],
-            quats=splats["quats"],
-            scales=torch.exp(splats["scales"]),
-            opacities=torch.sigmoid(splats["opacities"]),
+            **stored, scales=torch.exp(splats["scales"]), opacities=torch.sigmoid(splats["opacities"]),
             colors=torch.cat([named[name] for name in ("sh/dc", "sh/rest") if name in named], dim=1),
-            viewmats=viewmats[index : index + 1],
-            Ks=Ks[index : index + 1],
-            width=width,
-            height=height,
-            **options,
-        )
+            viewmats=viewmats[index : index + 1], Ks=Ks[index : index + 1], **options,
+        )  # fmt: skip
         return found[0][0, ..., :3].permute(2, 0, 1)
 
     def loss_of(image: Tensor, index: int) -> Tensor:
-        exact = image.double()
-        target = images[index].permute(2, 0, 1).to(exact.device)
-        return view_loss(exact, backend_of(exact).view_loss(target, loss, exact))
+        return exact_loss(image, images[index].permute(2, 0, 1), loss)
 
     return RendererHessian(image_of, named, loss_of, range(len(images)))

@@ -15,7 +15,7 @@ def sentences(bumps: Bumps, noise: float = 0.0) -> list[str]:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_good_renderer_passes(dtype):
     found = check_renderer(Bumps(dtype).hessian(), torch.Generator().manual_seed(0))
-    assert found.passed and found.record()["passed"] and found.error < 0.05
+    assert not found.sentences and found.error < 0.05
     assert all(abs(off) < 2e-3 for off, _ in found.gradients.values()) and list(found.gradients) == list(Bumps().named)
 
 
