@@ -2,6 +2,7 @@
 # make test   install, also the developers' tools, then ruff, pyright and pytest
 # make test-everywhere   the tests as other processors run them, which takes hours
 # make docs   the documentation as pages, in build/docs
+# make test-release   the documentation, and a wheel in a new environment that runs every example, which takes minutes
 # make setup  the shared first half: an environment in .venv with everything that the commands need
 # make clean  remove the environment and builds; what you trained and measured, in runs/, stays
 PYTHON ?= python3
@@ -11,7 +12,7 @@ STAMP := $(VENV)/.installed
 TOOLS := $(VENV)/.tools-installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: setup demo test test-everywhere docs clean
+.PHONY: setup demo test test-everywhere test-release docs clean
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
@@ -41,6 +42,9 @@ test-everywhere: $(TOOLS)
 docs: setup
 	$(PIP) --editable '.[docs]'
 	$(BIN)/mkdocs build --strict --site-dir build/docs
+
+test-release: $(TOOLS) docs
+	$(BIN)/python -m tests.release
 
 clean:
 	rm -rf $(VENV) build *.egg-info

@@ -97,7 +97,7 @@ def draw_densities(records: Records) -> Figure:
                 if sign * (end.value or 0.0) > 0:
                     ends.append(axes.axvline(sign * (end.value or 0.0), color=look["color"], **END))
         for axes, words in zip(panels, ("down", "up"), strict=True):
-            axes.set(xscale="log", yscale="log", xlabel="|curvature| (loss per squared stored unit)")
+            axes.set(xscale="log", yscale="log", xlabel="|curvature| (loss per squared unit of the parameters)")
             axes.set_title(f"Directions that curve {words}", loc="left")
             axes.grid(True)
             if all(line in ends for line in axes.lines):
@@ -161,7 +161,7 @@ def draw_slices(records: Records) -> Figure:
         for axes in panels.ravel()[len(planes) :]:
             axes.set_axis_off()
         scales = "" if same else " (axes differ in scale)"
-        figure.supxlabel(f"step along the steepest direction, stored units{unit_suffix(exponent)}{scales}", fontsize=7)
+        figure.supxlabel(f"step along the steepest, units of the parameters{unit_suffix(exponent)}{scales}", fontsize=7)
         figure.supylabel(f"step along the second{unit_suffix(exponent)}", fontsize=7)
         change = f"change of loss{unit_suffix(power)}"
         figure.colorbar(filled, ax=panels, label=change, ticks=MaxNLocator(LEVELS // 2))  # pyright: ignore[reportArgumentType]
@@ -194,7 +194,7 @@ def draw_sections(records: Records) -> Figure:
                 line = field.through_centre(field.rise, number) / 10.0**power
                 axes.plot(along.steps / 10.0**steps, line, **look)
         for axes, which in zip(panels, ("steepest", "second"), strict=True):
-            axes.set_xlabel(f"step, stored units{unit_suffix(steps)}")
+            axes.set_xlabel(f"step, units of the parameters{unit_suffix(steps)}")
             axes.set_title(f"Along the {which} direction", loc="left")
             axes.xaxis.set_major_locator(MaxNLocator(5))
             axes.grid(True)

@@ -66,7 +66,7 @@ def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray, ends: Mapping[st
     axes.set_yticks([10.0**-k for k in range(0, DECADES, 2)], [power_of_ten(-k) for k in range(0, DECADES, 2)])
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_ylim(10.0**-DECADES, 10.0 ** (ROOM[0 if ends else 2] + 1))
-    axes.set_xlabel(f"curvature{unit_suffix(exponent)},\nloss per squared stored unit")
+    axes.set_xlabel(f"curvature{unit_suffix(exponent)},\nloss per squared unit of the parameters")
     axes.set_ylabel("density over\nits highest")
     axes.grid(True)
 

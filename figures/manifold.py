@@ -1,6 +1,6 @@
 """Recorded slices of several landscapes to one scale, for the figures that compare them.
 
-Every slice is drawn along its own two steepest eigenvectors, but all share their axes: steps in stored units, as far
+Every slice is drawn along its own two steepest eigenvectors, but all share their axes: steps in units of the parameters, as far
 as the widest of them reaches, and the change of the loss from its own centre.  So a valley that is narrower looks narrower.
 Where a slice was not recorded that far there is nothing.
 """
@@ -69,7 +69,7 @@ class Scale:
 
     def flat_label(self, name: str) -> str:
         """Label of a horizontal axis, which has the room for the unit below."""
-        return f"{self.step_label(name)}\n(stored units)"
+        return f"{self.step_label(name)}\n(units of the parameters)"
 
     def holding(self, other: Plane) -> "Scale":
         """Limits with the same steps that hold another landscape's sections too."""

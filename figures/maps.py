@@ -208,8 +208,8 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
         parts = {
             "photograph": (0, 1, f"Gaussians with {share} of {end.name}"),
             "zero": (0, 2, f"Render: loss {quantity(end.losses[1])}"),
-            "minus": (1, 0, f"{step} stored units back: loss {back}"),
-            "plus": (1, 1, f"{step} stored units forth: loss {forth}"),
+            "minus": (1, 0, f"{step} units of the parameters back: loss {back}"),
+            "plus": (1, 1, f"{step} units of the parameters forth: loss {forth}"),
         }
         ways = {name: sheet.show(row, column, maps[name], title) for name, (row, column, title) in parts.items()} | {
             "view": whole

@@ -1,6 +1,6 @@
 """The recorded 2-D slice as the figures want it: losses relative to the centre, axes with their names and units.
 
-x, y        steps along the two directions: in stored units where they are unit vectors, else as `scale` says
+x, y        steps along the two directions: in units of the parameters where they are unit vectors, else as `scale` says
 change      loss minus the loss at the centre
 unit        sqrt(2 loss_scale / |curvature|): the step within which the curvature alone changes the loss by loss_scale
 evaluated   a point that is a true render; the others are interpolated, or unknown where the plane is not resolved
@@ -33,7 +33,7 @@ class Direction:
     unit: float
     steps: np.ndarray
     exponent: int
-    scale: str = "stored units"
+    scale: str = "units of the parameters"
     kind: str = ""
 
     @property

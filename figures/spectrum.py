@@ -84,7 +84,7 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
     axes.set_xlim(0, len(values) + 1)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.set_xlabel("rank of the eigenvalue")
-    axes.set_ylabel("eigenvalue (loss per\nsquared stored unit)")
+    axes.set_ylabel("eigenvalue (loss per\nsquared unit of the parameters)")
     axes.set_title(f"{len(values)} eigenvalues, met on the way to both ends", loc="left")
     axes.grid(True)
     looks = [(f"residual < {CONVERGED:.0%} of the value", "0.3", "0.3"), ("not converged", "0.3", "white")]
@@ -111,7 +111,7 @@ def _draw_distribution(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> No
             axes.step(x, np.append(sums, sums[-1]) / (sums[-1] or 1.0), where="post", **look)
     axes.axvline(0, color=BLACK, linewidth=0.6)
     axes.set_ylim(-0.03, 1.03)
-    axes.set_xlabel("curvature x, loss per squared stored unit")
+    axes.set_xlabel("curvature x, loss per squared unit of the parameters")
     axes.set_ylabel("share ≤ x")
     axes.set_title(f"Share below x; a staircase for each of {len(nodes)} starts", loc="left")
     axes.grid(True)

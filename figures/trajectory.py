@@ -32,7 +32,7 @@ PANELS = {
     "participation_ratio": "participation ratio",
     "gaussians": "Gaussians",
 }
-UNITS = "traces, eigenvalues: loss per squared stored unit"
+UNITS = "traces, eigenvalues: loss per squared unit of the parameters"
 PANEL = 1.12  # inches of height
 LEGEND_LINE = 0.14
 ARROW: dict[str, Any] = {"marker": r"$\uparrow$", "markersize": 7, "linestyle": "none"}  # stands on a lower bound

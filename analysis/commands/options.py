@@ -74,7 +74,7 @@ class ViewOptions:
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Train and probe an embedded synthetic scene, and say which pictures to open."""
+    """Train and probe an embedded synthetic scene, and say which page to open."""
 
     out: Path = Path("runs/demo")
     """Folder of the demo's scene and run.  Where it exists, the next free of OUT-2, OUT-3, ... is used."""

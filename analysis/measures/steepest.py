@@ -179,7 +179,7 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
     """Sentence that compares renders with the curvature, at the step shown and over all steps, which descend."""
     best = shown_step(factors)
     step, factor, alone = steps[best], factors[best], 50 * end.curvature * steps[best] ** 2 / loss
-    extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])} stored units"
+    extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])} units of the parameters"
     ways = ("lower", "raise") if end.curvature < 0 else ("raise", "lower")
     if not factor > 0:
         kind = "negative curvature" if end.curvature < 0 else "curvature"
@@ -187,9 +187,8 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
             f"The {kind} along {end.name} is not confirmed by renders: {extent} {ways[1]} the loss, back and forth together, "
             f"where by the curvature they would {ways[0]} it."
         )
-    text = (
-        f"A step of {quantity(step)} stored units along {end.name} {ways[0]}s the loss by {rough(abs(factor * alone))}%"
-    )
+    moved = f"{quantity(step)} units of the parameters along {end.name}"
+    text = f"A step of {moved} {ways[0]}s the loss by {rough(abs(factor * alone))}%"
     text += f", the mean of back and forth (by its curvature alone: {rough(abs(alone))}%)"
     if abs(factor - 1) > AGREES:
         text += f", {quantity(factor)} times as much as the curvature has it"

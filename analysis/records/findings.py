@@ -160,7 +160,7 @@ def _of_ends(data: ProbeRecord) -> list[Line]:
     ends, norm = data.eigenvalues, data.objective.gradient_norm
     numbers = [number for end in (ends.max, ends.min) for number in (end.value, end.residual) if _is_finite(number)]
     if len(numbers) < 4:
-        return [Line("The ends of the spectrum were not determined.", "failure")]
+        return [Line("The extreme eigenvalues were not determined.", "failure")]
     top, top_error, bottom, bottom_error = numbers
     where = f"over {data.counts.active_parameters:,} parameters"
     where += f", with a gradient of norm {quantity(norm)}," if _is_finite(norm) else ""

@@ -72,7 +72,7 @@ class TraceOf(Struct, kw_only=True):
     standard_error: of value; 0 where the method is exact.  low, high: ends of the interval at `confidence`, e.g. 0.95.
     sign: "undetermined" where the interval does not decide it.  dim: parameters of the block.  probes: random vectors; 0 where
     exact.  matvecs: products H v.  reason: why it stopped, one of `landscape.results.StopReason`.
-    method: "exact", or "exact, the coupling of pixels sampled with random signs".  note: why value is null, ...
+    method: "exact", or "exact, but SSIM's window is sampled".  note: why value is null, ...
     views_error: where training views were left out (`Counts.views_of`), the standard error of value as an estimate for all
     views, as if those measured had been drawn at random; null where not known.
     """

@@ -141,10 +141,10 @@ def _depth_rows(depth: Depth | None) -> Iterator[Row]:
 def _share_rows(shares: Iterable[BlockShare]) -> Iterator[Row]:
     """Rows of the shares of operators' squared entries."""
     for one in shares:
-        coupling = "" if one.ssim_window else ", without SSIM's window"
+        window = "" if one.ssim_window else ", without SSIM's window"
         about = f"attributes' blocks {quantity(one.attributes)}, diagonal {quantity(one.diagonal)}"
         error = None if one.blocks is None else one.blocks * one.relative_error
-        yield f"in blocks: {OPERATOR_NAMES[one.operator]}{coupling}", measured(one.blocks, error), about
+        yield f"in blocks: {OPERATOR_NAMES[one.operator]}{window}", measured(one.blocks, error), about
 
 
 def _index(index: Index) -> tuple[str, str]:

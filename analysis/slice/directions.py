@@ -3,7 +3,7 @@
     eigenvectors    e₁, e₂: unit eigenvectors of the two largest eigenvalues of H.  Radius in curvature units; 3
     random          r₁, r₂: Gaussian, of every attribute of every Gaussian as long as that attribute is (of a mean: as its
                     distance from the origin), so that a radius of 0.001 changes each by about a thousandth; 0.001
-    gradient        unit vector of the steepest ascent.  Radius in stored units; 3 curvature units
+    gradient        unit vector of the steepest ascent.  Radius in units of the parameters; 3 curvature units
     line            from the checkpoint, at 0, to the other, at 1.  Radius: how far beyond both; 0.5.  With a third checkpoint a
                     plane through all three, at (0, 0), (1, 0) and (0, 1): line₁, line₂
 
@@ -107,7 +107,7 @@ class Direction:
     name: str
     vector: Float[Tensor, " n"]
     residual: float | None = None
-    scale: str = "stored units"
+    scale: str = "units of the parameters"
 
 
 def find_directions(

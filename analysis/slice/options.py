@@ -34,7 +34,7 @@ class SliceOptions:
     """How far to look each way; given twice, one for each direction.
     eigenvectors: in curvature units, within which the curvature alone changes the loss by 0.1%.  Default: 3.
     random: as a share of each parameter's size.  Default: 0.001.
-    gradient: in stored units.  Default: 3 curvature units.
+    gradient: in units of the parameters.  Default: 3 curvature units.
     line: beyond both ends, as a share of their distance.  Default: 0.5."""
     points: int = 41
     """Points along each direction, odd; a line to OTHER may get a few more or less."""

@@ -14,7 +14,7 @@ from splat.training.origin.options import Trainer
 class TrainOptions:
     """Train 3D Gaussian Splatting on a few views of a scene and score it on the views held out.
 
-    LPIPS stands among the scores where its package is installed: pip install 'splat-landscape[lpips]'.
+    LPIPS is a score too after: pip install 'splat-landscape[lpips]'
     """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
@@ -77,4 +77,4 @@ class TrainOptions:
     probe_every: int | None = None
     """Steps between records in OUT/trajectory.csv."""
     probe_quick: bool = False
-    """Coarse ones, in a third of the time."""
+    """With wider errors, in a third of the time."""

@@ -107,7 +107,9 @@ def test_a_start_that_slopes_down_is_not_cut_off_at_the_ends_own_limits(runs):
 @pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
 def test_steps_have_their_unit(runs, module):
     flat = [axes for axes in module.draw(runs).axes if axes.get_xlabel().startswith("step along")]
-    assert all("stored units" in axes.get_xlabel() for axes in flat if not hasattr(axes, "get_zlim")) and flat
+    assert (
+        all("units of the parameters" in axes.get_xlabel() for axes in flat if not hasattr(axes, "get_zlim")) and flat
+    )
 
 
 @pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])

@@ -72,7 +72,7 @@ STEPS = [0.2, 0.1, 0.05]
 
 
 MEAN = "the mean of back and forth (by its curvature alone:"
-STEP, RANGE = "A step of 0.100 stored units along e", "steps of 0.0500 to 0.200 stored units"
+STEP, RANGE = "A step of 0.100 units of the parameters along e", "steps of 0.0500 to 0.200 units of the parameters"
 REFUTED = f"along e is not confirmed by renders: {RANGE}"
 TOGETHER = "back and forth together, where by the curvature"
 
@@ -80,7 +80,11 @@ TOGETHER = "back and forth together, where by the curvature"
 @pytest.mark.parametrize(
     ("curvature", "factors", "said"),
     [
-        (4.0, [1.1, 1.0, 0.9], f"A step of 0.200 stored units along e raises the loss by 4.4%, {MEAN} 4.0%)."),
+        (
+            4.0,
+            [1.1, 1.0, 0.9],
+            f"A step of 0.200 units of the parameters along e raises the loss by 4.4%, {MEAN} 4.0%).",
+        ),
         (
             4.0,
             [3.0, 0.9, 1.0],

@@ -287,7 +287,7 @@ def test_records_of_extreme_size_and_without_numbers_make_a_page(tmp_path, scale
     data["eigenvalues"]["min"] |= {"value": math.nan}
     arrays["slice"]["loss"][:3] = math.nan
     text = Page(page(tmp_path / "probe", data, arrays)).text
-    assert "not a number" in text and "The ends of the spectrum were not determined" in text
+    assert "not a number" in text and "The extreme eigenvalues were not determined" in text
 
 
 def test_a_number_without_its_error_is_never_shown_as_exact(tmp_path):
