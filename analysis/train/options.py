@@ -13,7 +13,6 @@ from splat.training.origin.options import Trainer
 @dataclass(frozen=True)
 class TrainOptions:
     """Train 3D Gaussian Splatting on a few views of a scene and score it on the views held out.
-
     LPIPS is a score too after: pip install 'splat-landscape[lpips]'
     """
 
@@ -73,7 +72,7 @@ class TrainOptions:
     log_every: int = 100
     """Steps between rows of OUT/train.csv."""
     track: Annotated[Literal["tensorboard", "wandb", "trackio"] | None, arg(metavar="NAME")] = None
-    """Also give them to tensorboard (in OUT/tracked), wandb or trackio."""
+    """Give them to tensorboard, wandb or trackio."""
     probe_every: int | None = None
     """Steps between records in OUT/trajectory.csv."""
     probe_quick: bool = False
