@@ -27,7 +27,7 @@ from splat.model.untrusted import loose_json
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, explicit_split, read_names, split_scene
 from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_frame, posed, shift_of, shift_to_origin
-from splat.training.origin.likeness import Photographs, Reading
+from splat.training.origin.likeness import Reading, likeliest
 from splat.training.origin.options import Foreign
 from splat.training.origin.presets import PRESETS, Preset, World, preset_of, render_of
 from splat.training.origin.scene_reference import SceneReference
@@ -64,10 +64,9 @@ def foreign_training(
     reference = SceneReference.to(scene, path, split, images, downscale)
     config = _config(scene, found, preset.loss, render, ask)
     names = [split.train[i * len(split.train) // GUARDED] for i in range(min(GUARDED, len(split.train)))]
-    photographs = Photographs(scene, names, config, centred=preset.centred)
     found_in = partial(_readings, found, scene, path)
-    reading = photographs.best(found_in(preset.world), _elsewhere(preset.world, found_in))
-    level = photographs.require(reading, picture)
+    tried = found_in(preset.world), _elsewhere(preset.world, found_in)
+    reading, level = likeliest(*tried, scene, names, config, picture, centred=preset.centred)
     similarity = reading.similarity
     reference = replace(reference, similarity=similarity, centred=preset.centred)
     moved = posed(scene, similarity, centred=preset.centred)

@@ -11,6 +11,7 @@ order of colours in a grey scene.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from math import inf, isfinite, isnan
@@ -25,6 +26,7 @@ from splat.model.files.quantised import turned
 from splat.model.files.splat_file import logit
 from splat.model.gaussians import Gaussians
 from splat.render.render import render
+from splat.scenes.images import resize_by_area
 from splat.scenes.scene import Scene
 from splat.scenes.view import View
 from splat.scenes.write import bytes_of, png
@@ -76,80 +78,66 @@ def mistaken(reading: Reading) -> Iterator[Reading]:
         yield read("logarithms of scales", "scales", log_scales=g.log_scales.log())
 
 
-class Photographs:
-    """Training views of a scene, before which readings are compared.  centred: principal points are the pictures' middles."""
+def likeliest(
+    readings: Iterable[Reading], elsewhere: Iterable[Reading], scene: Scene, names: Sequence[str], config: TrainConfig,
+    picture: Path, *, centred: bool,
+) -> tuple[Reading, float]:  # fmt: skip
+    """The reading that looks most like the training views of these names, and its PSNR there, dB.
 
-    def __init__(self, scene: Scene, names: Sequence[str], config: TrainConfig, *, centred: bool) -> None:
-        self.scene, self.config, self.centred = scene, config, centred
-        self.views = scene.load(names)
-        self.small = [_small(view) for view in self.views]
-
-    def best(self, readings: Iterable[Reading], elsewhere: Iterable[Reading]) -> Reading:
-        """The one that looks most like the photographs.
-
-        elsewhere: mistaken readings in other worlds, where nothing looks like a scene, and which then alone are tried.
-        InputError where a mistaken reading looks clearly better, and like the scene.
-        """
-        own, best = max(((self.on_small(each), each) for each in readings), key=itemgetter(0))
-        others = chain(mistaken(best), elsewhere if own < least(self.small) else ())
-        level, other = max(((self.on_small(each), each) for each in others), key=itemgetter(0))
-        if level > own + CLEARLY and level >= least(self.small):
-            before = f"{own:.1f}" if isfinite(own) else "no picture"
-            raise InputError(
-                f"expected {other.fault}: so read, it looks more like the photographs ({level:.1f} dB against {before} on "
-                f"small training views); {other.remedy}"
-            )
-        return best
-
-    def on_small(self, reading: Reading) -> float:
-        """dB; what cannot be rendered looks like nothing."""
-        try:
-            level = likeness(self.images(reading, self.small), self.small)
-        except InputError:
-            return -inf
-        return -inf if isnan(level) else level
+    elsewhere: mistaken readings in other worlds, tried where nothing looks like the scene.  Colours are compared as the loss
+    does, not cut to [0, 1].  InputError where a mistaken reading looks clearly better, below LEAST_PSNR, and below MARGIN above
+    what pictures of one colour have, each its photograph's mean: this is low where photographs have little contrast.
+    picture: where render and photograph are written side by side then.
+    """
+    views = scene.load(names)
+    small = [_small(view) for view in views]
 
     @torch.no_grad()
-    def images(self, reading: Reading, views: Sequence[View]) -> list[torch.Tensor]:
-        frames = posed(self.scene, reading.similarity, centred=self.centred).select([view.name for view in views])
-        gaussians, background = reading.gaussians, self.config.background_colour(reading.gaussians.flat.dtype)
-        cameras = [
-            frame.camera.resized(view.camera.width, view.camera.height)
-            for frame, view in zip(frames, views, strict=True)
-        ]
-        return [render(gaussians, camera, background, self.config.render).image for camera in cameras]
+    def images(reading: Reading, views: Sequence[View]) -> list[torch.Tensor]:
+        frames = posed(scene, reading.similarity, centred=centred).select(names)
+        sizes = [(view.camera.width, view.camera.height) for view in views]
+        cameras = [frame.camera.resized(*size) for frame, size in zip(frames, sizes, strict=True)]
+        background = config.background_colour(reading.gaussians.flat.dtype)
+        return [render(reading.gaussians, camera, background, config.render).image for camera in cameras]
 
-    def require(self, reading: Reading, picture: Path) -> float:
-        """PSNR of a reading, dB, in the pictures' own size.
+    def seen(reading: Reading) -> float:
+        with suppress(InputError):  # of what cannot be rendered
+            if not isnan(level := likeness(images(reading, small), small)):
+                return level
+        return -inf
 
-        Colours are compared as the loss does, not cut to [0, 1].  InputError below LEAST_PSNR, or below MARGIN above what
-        pictures of one colour have, each its photograph's mean: this is low where photographs have little contrast.
-        """
-        images = self.images(reading, self.views)
-        level = likeness(images, self.views)
-        if not level >= (wanted := least(self.views)):
-            picture.parent.mkdir(parents=True, exist_ok=True)
-            both = torch.cat([images[0].clamp(0, 1), self.views[0].image], dim=2)
-            picture.write_bytes(png(bytes_of(both)))
-            raise InputError(
-                f"expected Gaussians that look like the scene's photographs, got {level:.1f} dB on training views (at least "
-                f"{wanted:.1f}; pictures of one colour have {plain(self.views):.1f}); is this their scene? else it is "
-                "other images (--images, --downscale), or another trainer (--trained-by), whose world or signs differ; "
-                f"{picture} shows the render beside the photograph"
-            )
-        return level
+    own, best = max(((seen(each), each) for each in readings), key=itemgetter(0))
+    others = chain(mistaken(best), elsewhere if own < least(small) else ())
+    level, other = max(((seen(each), each) for each in others), key=itemgetter(0))
+    if level > own + CLEARLY and level >= least(small):
+        before = f"{own:.1f}" if isfinite(own) else "no picture"
+        raise InputError(
+            f"expected {other.fault}: so read, it looks more like the photographs ({level:.1f} dB against {before} on small "
+            f"training views); {other.remedy}"
+        )
+    rendered = images(best, views)
+    level = likeness(rendered, views)
+    if not level >= (wanted := least(views)):
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        picture.write_bytes(png(bytes_of(torch.cat([rendered[0].clamp(0, 1), views[0].image], dim=2))))
+        raise InputError(
+            f"expected Gaussians that look like the scene's photographs, got {level:.1f} dB on training views (at least "
+            f"{wanted:.1f}; pictures of one colour have {plain(views):.1f}); is this their scene? else it is other images "
+            "(--images, --downscale), or another trainer (--trained-by), whose world or signs differ; "
+            f"{picture} shows the render beside the photograph"
+        )
+    return best, level
 
 
 def _small(view: View) -> View:
     camera = view.camera
     ratio = min(1.0, SMALL / min(camera.width, camera.height))
-    width, height = round(ratio * camera.width), round(ratio * camera.height)
-    image = torch.nn.functional.interpolate(view.image[None], (height, width), mode="area")[0]
-    return View(view.name, camera.resized(width, height), image)
+    size = round(ratio * camera.width), round(ratio * camera.height)
+    return View(view.name, camera.resized(*size), resize_by_area(view.image, *size))
 
 
 def likeness(images: Sequence[torch.Tensor], views: Sequence[View]) -> float:
-    """Mean PSNR, dB, of colours as they are: those beyond [0, 1] belong to the loss."""
+    """Mean PSNR, dB."""
     pairs = zip(images, views, strict=True)
     return fmean(float(-10 * (image.double() - view.image).square().mean().log10()) for image, view in pairs)
 
