@@ -1,11 +1,11 @@
-"""The paper's nine statements, judged on a study: `python -m notebooks.paper [STUDY ...] [--out OUT]`.
+"""The paper's ten statements, judged on a study: `python -m notebooks.paper [STUDY ...] [--out OUT]`.
 
 STUDY   folders that hold runs, such as that of a sweep; a table study.csv; or a folder with one, by default notebooks/results
 
 OUT/study.csv        the runs (`notebooks.paper.study`)
 OUT/claims.csv       the effects behind each verdict (`notebooks.paper.statements`)
-OUT/predictors.csv   correlation of quantities with the score (`notebooks.paper.predictors`)
-OUT/*.png, *.pdf     the figures, OUT/captions.md their captions and the nine verdicts (`notebooks.paper.figures`)
+OUT/predictors.csv   rank correlation of quantities with the score (`notebooks.paper.predictors`)
+OUT/*.png, *.pdf     the figures, OUT/captions.md their captions and the ten verdicts (`notebooks.paper.figures`)
 
 `landscape sweep notebooks/study_small.toml; python -m notebooks.paper runs/study-small` repeats the stored results.
 """
@@ -22,6 +22,7 @@ from analysis.console.failures import program
 from analysis.console.plain import say
 from analysis.records.run_files import read_trajectory
 from figures.scripts import print_files
+from notebooks.paper.effects import UNTESTED
 from notebooks.paper.figures import RESULTS, make
 from notebooks.paper.predictors import predictors
 from notebooks.paper.statements import LEAST, Judgement, effect_table, judgements
@@ -29,7 +30,9 @@ from notebooks.paper.study import study, unended
 from notebooks.paper.table import FILE
 from splat.training.checkpoint import write_atomically
 
-STYLES = {"holds": "green", "holds in part": "yellow", "does not hold": "red", "cannot be tested here": "dim"}
+STYLES = {"holds": "green", "holds in part": "yellow", "does not hold": "red"} | dict.fromkeys(
+    ("undecided", UNTESTED), "dim"
+)
 ALONG = "trajectories.csv"  # beside study.csv: the records along some of its trainings
 
 

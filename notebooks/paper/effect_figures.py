@@ -10,10 +10,14 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from analysis.records.findings import attribute_name
 from figures.style import BLUE, UNDETERMINED, VERMILION, new_figure, style
+from notebooks.paper.effects import UNTESTED
 
 UNITS = {"×": "ratio (×)", "dB": "PSNR gained (dB)", "": "share or correlation"}
-KINDS = {"all": "all runs", "between": "means of methods", "within": "seeds of a method"}
-VERDICTS = {"holds": BLUE, "holds in part": BLUE, "does not hold": VERMILION, "cannot be tested here": UNDETERMINED}
+GIVEN, SIGNIFICANT = "given training PSNR, ln N", 0.05
+KINDS = {"all": "all runs", "given": GIVEN, "within": "seeds of a method"}
+VERDICTS = {"holds": BLUE, "holds in part": BLUE, "does not hold": VERMILION} | dict.fromkeys(
+    ("undecided", UNTESTED), UNDETERMINED
+)
 ROW, PANEL, WRAP = 0.17, 1.05, 76  # inches; characters
 CROWDED = 1e3  # from the least ratio to the largest: powers of ten alone are labelled
 FAR = 1e4  # a ratio beyond this, or below its inverse, ends at the edge
@@ -79,7 +83,7 @@ WORDS = {  # of quantities whose names do not say it
 
 
 def draw_predictors(table: pd.DataFrame) -> Figure:
-    """A panel for each kind of correlation, a row a quantity."""
+    """A panel for each kind of tau, a row a quantity."""
     names = list(dict.fromkeys(table["quantity"]))[::-1]
     with style():
         figure = new_figure(0.8 + ROW * max(len(names), 3), 6.8)
@@ -87,16 +91,16 @@ def draw_predictors(table: pd.DataFrame) -> Figure:
         for axes, (kind, title) in zip(panels, KINDS.items(), strict=True):
             part = pd.DataFrame(table[table["kind"] == kind])
             places = [names.index(name) for name in part["quantity"]]
-            decided = ((part["low"] > 0) | (part["high"] < 0)).to_numpy(bool)
-            colours = np.where(decided, VERMILION, "0.55")
+            colours = np.where(part["holm"] < SIGNIFICANT, VERMILION, "0.55")
             axes.hlines(places, part["low"], part["high"], color=list(colours), linewidth=1.2)
-            axes.scatter(part["rho"], places, color=list(colours), s=11, zorder=2)
+            axes.scatter(part["tau"], places, color=list(colours), s=11, zorder=2)
             axes.axvline(0, color="0.5", linewidth=0.6)
-            axes.set_title(f"{title} (n = {max(part['n'], default=0)})", loc="left")
+            axes.set_title(title, loc="left")
             axes.grid(True, axis="x")
         panels[0].set_yticks(range(len(names)), [words_of(name) for name in names])
         panels[0].set_xlim(-1.05, 1.05)
-        panels[1].set_xlabel("rank correlation with PSNR on held-out views; orange: the interval excludes 0")
+        words = f"Kendall's tau with PSNR on held-out views, {max(table['n'], default=0)} runs"
+        panels[1].set_xlabel(f"{words}; orange: p < {SIGNIFICANT} after Holm's correction")
     return figure
 
 

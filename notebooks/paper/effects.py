@@ -1,14 +1,15 @@
 """Effects of methods in a study, their intervals over seeds, and the verdict on each of the paper's claims.
 
-An effect is a mean over trainings, or over pairs (scene, seed) that both methods have, with Student's 95% interval.  Ratios are
-averaged as logarithms.  A training repeated on several machines counts once.  The verdict compares the interval with no effect
-and with the size that the paper claims:
+An effect is a mean over trainings, or over pairs (scene, seed) that both methods have, with Student's 95% interval: of gains in
+PSNR from the deviation pooled over all methods, as a handful of seeds of one tells little of it, else from the effect's own.
+Ratios are averaged as logarithms.  A training repeated on several machines counts once.  The verdict compares the interval with
+no effect and with the size that the paper claims:
 
     interval beyond no effect, reaches the claimed size         holds
     interval beyond no effect, falls short of that size         holds in part
     interval not beyond no effect, falls short of that size     does not hold
-    interval includes no effect and that size                   cannot be tested here: the seeds do not decide
-    fewer than three trainings or pairs                         cannot be tested here
+    interval includes no effect and that size                   undecided
+    fewer than three trainings or pairs                         cannot be tested at this size
 """
 
 from collections.abc import Sequence
@@ -21,7 +22,8 @@ from scipy.special import stdtrit
 
 from analysis.records.quantities import quantity
 
-Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested here"]
+UNTESTED = "cannot be tested at this size"
+Verdict = Literal["holds", "holds in part", "does not hold", "undecided", "cannot be tested at this size"]
 LEAST, CONFIDENCE = 3, 0.95
 BASE, STABLE = "3dgs", "stablegs"
 SCORE = "psnr"
@@ -40,8 +42,8 @@ class Interval:
     n: int
 
     @classmethod
-    def of(cls, values: Sequence[float] | pd.Series) -> "Interval":
-        """The interval of the mean of all finite values.
+    def of(cls, values: Sequence[float] | pd.Series, pooled: tuple[float, int] | None = None) -> "Interval":
+        """The interval of the mean of all finite values.  pooled: their deviation and its degrees of freedom, where known.
 
         >>> Interval.of([1.0, 2.0, 3.0])
         Interval(value=2.0, low=-0.484..., high=4.484..., n=3)
@@ -51,7 +53,8 @@ class Interval:
         n = len(known)
         if n < 2:
             return cls(float(known.mean()) if n else np.nan, -np.inf, np.inf, n)
-        half = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * known.std(ddof=1) / np.sqrt(n))
+        deviation, freedom = pooled or (float(known.std(ddof=1)), n - 1)
+        half = float(stdtrit(freedom, (1 + CONFIDENCE) / 2) * deviation / np.sqrt(n))
         return cls(float(known.mean()), float(known.mean()) - half, float(known.mean()) + half, n)
 
     def exp(self) -> "Interval":
@@ -90,17 +93,17 @@ def decide(effect: Effect) -> Verdict:
     >>> decide(Effect("", Interval(1.2, 1.0, 1.4, 3), 0.0, 1.3)), decide(Effect("", Interval(0.5, 0.3, 0.7, 3), 0.0, 1.3))
     ('holds', 'holds in part')
     >>> decide(Effect("", Interval(0.1, -0.3, 0.7, 3), 0.0, 1.3)), decide(Effect("", Interval(1.0, -0.3, 2.3, 3), 0.0, 1.3))
-    ('does not hold', 'cannot be tested here')
+    ('does not hold', 'undecided')
     """
     if effect.interval.n < LEAST:
-        return "cannot be tested here"
+        return UNTESTED
     claimed = effect.null if effect.claimed is None else effect.claimed
     sign = -1 if claimed < effect.null else 1
     low, high = sorted((sign * effect.interval.low, sign * effect.interval.high))
     beyond, reaches = low > sign * effect.null, high >= sign * claimed
     if beyond:
         return "holds" if reaches else "holds in part"
-    return "cannot be tested here" if reaches else "does not hold"
+    return "undecided" if reaches else "does not hold"
 
 
 def numbers(rows: pd.DataFrame, name: str, method: str | None = None, keys: Sequence[str] = PAIR) -> pd.Series:
@@ -121,6 +124,17 @@ def _means(values: pd.Series, keys: Sequence[str]) -> pd.Series:
 def gains(rows: pd.DataFrame, method: str) -> pd.Series:
     """PSNR minus that of 3DGS, dB, by scene and seed."""
     return (numbers(rows, SCORE, method) - numbers(rows, SCORE, BASE)).dropna()
+
+
+def gain(rows: pd.DataFrame, method: str, over: str = BASE) -> Interval:
+    """PSNR minus that of another method, dB, with the deviation of such differences that all methods have together."""
+    if over not in set(rows["method"]) or SCORE not in rows:
+        return Interval.of([])
+    table = rows.pivot_table(SCORE, list(PAIR), "method")
+    each = table.sub(table[over], axis=0).drop(columns=over)
+    freedom = int((each.count() - 1).clip(lower=0).sum())
+    deviation = float(np.sqrt(np.nansum((each - each.mean()) ** 2) / max(freedom, 1)))
+    return Interval.of(each.get(method, []), (deviation, freedom) if freedom else None)
 
 
 def log_ratios(rows: pd.DataFrame, name: str, method: str = STABLE) -> pd.Series:

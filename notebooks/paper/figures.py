@@ -4,7 +4,7 @@ OUT/claims, predictors      the effects behind the verdicts, and what goes with 
 OUT/budget                  after Fig. 8: PSNR on held-out views against the time of a training
 OUT/axes                    after Tables 2 and 4: what the axes of StableGS's probes gain, alone and together
 OUT/index                   after Fig. 7: the anisotropy index over the steps, with the band of the seeds
-OUT/captions.md             a caption for each, and the nine verdicts, written from the numbers
+OUT/captions.md             a caption for each, and the ten verdicts, written from the numbers
 
 Each figure as PNG and PDF.  A cell of the study that was not run is named where its number would be.
 """
@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
-from notebooks.paper.effect_figures import draw_claims, draw_predictors, words_of
-from notebooks.paper.effects import BASE, LEAST, SCORE, STABLE, Interval, gains, log_ratios, numbers
+from notebooks.paper.effect_figures import GIVEN, SIGNIFICANT, draw_claims, draw_predictors, words_of
+from notebooks.paper.effects import BASE, LEAST, SCORE, STABLE, Interval, gain, log_ratios, numbers
 from notebooks.paper.predictors import predictors
 from notebooks.paper.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
 from splat.model.untrusted import replacing
@@ -178,15 +178,15 @@ def draw_axes(rows: pd.DataFrame) -> Figure:
         figure = new_figure(0.6 + 0.17 * len(AXES), 4.6)
         axes = figure.add_subplot()
         for place, (_, method, claimed) in zip(range(len(AXES))[::-1], AXES):
-            gain = Interval.of(gains(rows, method))
-            if gain.n >= 2:
-                axes.hlines(place, gain.low, gain.high, color=BLUE, linewidth=1.2)
-            if gain.n:
-                axes.plot(gain.value, place, "o", color=BLUE, markersize=3.5)
-            if gain.n < 2:
+            found = gain(rows, method)
+            if found.n >= 2:
+                axes.hlines(place, found.low, found.high, color=BLUE, linewidth=1.2)
+            if found.n:
+                axes.plot(found.value, place, "o", color=BLUE, markersize=3.5)
+            if found.n < 2:
                 axes.annotate(
-                    "one seed" if gain.n else "not run",
-                    (gain.value if gain.n else 0, place),
+                    "one seed" if found.n else "not run",
+                    (found.value if found.n else 0, place),
                     xytext=(4, 0),
                     textcoords="offset points",
                     va="center",
@@ -232,14 +232,16 @@ def _time(rows: pd.DataFrame, method: str) -> pd.Series:
 
 
 def _of_predictors(related: pd.DataFrame) -> str:
-    decided = pd.DataFrame(related[(related["kind"] == "all") & ((related["low"] > 0) | (related["high"] < 0))])
-    best = sorted(decided.to_dict("records"), key=lambda row: -abs(row["rho"]))[:3]
-    if not best:
-        return "No quantity has a rank correlation with PSNR on held-out views whose interval excludes 0."
-    words = [
-        f"{words_of(row['quantity'])} ({row['rho']:+.2f}, {row['low']:+.2f} to {row['high']:+.2f})" for row in best
-    ]
-    return f"Over all runs PSNR on held-out views goes most with {', '.join(words)}; correlation is not cause."
+    found = []
+    for kind, words in {"all": "over all runs", "given": GIVEN, "within": "among the seeds of a method"}.items():
+        decided = pd.DataFrame(related[(related["kind"] == kind) & (related["holm"] < SIGNIFICANT)])
+        best = sorted(decided.to_dict("records"), key=lambda row: -abs(row["tau"]))[:3]
+        named = [
+            f"{words_of(row['quantity'])} ({row['tau']:+.2f}, {row['low']:+.2f} to {row['high']:+.2f})" for row in best
+        ]
+        tried = int((related["kind"] == kind).sum())
+        found.append(f"{words}: {', '.join(named) or 'none'} of {tried}")
+    return f"Goes with PSNR on held-out views after Holm's correction, {'; '.join(found)}. Correlation is not cause."
 
 
 def _of_budget(rows: pd.DataFrame, short: bool = False) -> str:
@@ -250,7 +252,7 @@ def _of_budget(rows: pd.DataFrame, short: bool = False) -> str:
     best = max(scores, key=lambda method: (scores[method].n >= LEAST, scores[method].value))
     times = {name: Interval.of(list(np.log(_time(rows, name)))).exp() for name in (best, STABLE) if name in scores}
     if short:
-        over = {name: Interval.of(gains(rows, name)).value for name in times}
+        over = {name: gain(rows, name).value for name in times}
         return "; ".join(
             f"{method_words(name)} {over[name]:+.1f} dB in {time.value:.2g} × the time" for name, time in times.items()
         )
@@ -259,9 +261,9 @@ def _of_budget(rows: pd.DataFrame, short: bool = False) -> str:
 
 
 def _of_axes(rows: pd.DataFrame) -> str:
-    known = {name.strip(): Interval.of(gains(rows, method)) for name, method, _ in AXES}
-    missing = [name for name, gain in known.items() if not gain.n]
-    words = [f"{name} {gain.text(' dB')}" for name, gain in known.items() if gain.n]
+    known = {name.strip(): gain(rows, method) for name, method, _ in AXES}
+    missing = [name for name, found in known.items() if not found.n]
+    words = [f"{name} {found.text(' dB')}" for name, found in known.items() if found.n]
     return "; ".join(words or ["no axis was run"]) + (f". Not run: {', '.join(missing)}." if missing else ".")
 
 
