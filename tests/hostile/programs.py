@@ -3,8 +3,8 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,6 @@ for _name in (*LATE, *(each.runs.split(":")[0] for each in cli.COMMANDS.values()
     import_module(_name)
 
 
-@contextmanager
-def nothing_begun(*_: object) -> Iterator[None]:
-    yield
-
-
 class forked:
     """A fork that runs a function, quietly and without pictures, and ends with what it returns."""
 
@@ -33,7 +28,7 @@ class forked:
         ready, begun = os.pipe()
         self.process = os.fork()
         if self.process == 0:
-            drawing._group, drawing._said = nothing_begun, lambda *_: []
+            drawing._group, drawing._said = lambda *_: nullcontext(), lambda *_: []
             quiet = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(quiet, 1)
             os.dup2(quiet, 2)
