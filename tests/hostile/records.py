@@ -62,8 +62,8 @@ def _write_probes(root: Path) -> None:
 def _use_probes(root: Path, chance: Random) -> Read:
     from rich.console import Console
 
-    from analysis.records import report
     from analysis.records.findings import findings
+    from analysis.records.page import report
     from analysis.records.records import ProbeRecord, read_record
     from analysis.records.tables import family_table, probe_table
     from analysis.runs.compare import cautions, render_page
@@ -152,7 +152,7 @@ def _write_map(root: Path) -> None:
 
 
 def _use_map(root: Path, chance: Random) -> Read:
-    from analysis.records import report
+    from analysis.records.page import report
     from analysis.records.records import read_record
 
     with patch.object(report, "interactive_surface", return_value=None):

@@ -80,7 +80,7 @@ def _server(viser: Any, options: ViewOptions) -> Any:
 
 def _link_from_report(run: Path, page: Path) -> None:
     """Write the probe's report anew, if there is one and the page lies where it links to."""
-    from analysis.records import report  # half a second of imports
+    from analysis.records.page import report  # half a second of imports
 
     if page.resolve() == (run / report.SPLATS).resolve() and (run / PROBE / report.FILE).is_file():
         report.write_report(run / PROBE)

@@ -212,8 +212,9 @@ def _readings(found: SplatFile, scene: Scene, path: Path, kind: World) -> Iterat
     else:
         worlds = [nerfstudio_frame(path, scene) if kind == "nerfstudio" else shift_to_origin(scene)]
     for gaussians, notes in ((found.gaussians, ()), (found.other_axes, (TURNED_BACK,))):
-        for world in worlds if gaussians is not None else ():
-            yield Reading(_near(gaussians, world) if kind == "scene" else gaussians, world, notes)
+        if gaussians is not None:
+            near = [_near(gaussians, world) if kind == "scene" else gaussians for world in worlds]
+            yield from (Reading(each, world, notes) for each, world in zip(near, worlds, strict=True))
 
 
 def _elsewhere(kind: World, found_in: Callable[[World], Iterator[Reading]]) -> Iterator[Reading]:
