@@ -110,7 +110,8 @@ def _of_scene(values: np.ndarray, methods: np.ndarray, count: int, within: bool)
     signs, member = np.sign(values[:, None] - values[None]), np.eye(count)[methods]
     if within:
         signs *= (methods[:, None] == methods[None])[..., None]
-    sums = np.einsum("ig,ijk,ijl,jh->ghkl", member, signs, signs, member, optimize=True)
+    of_rows = np.tensordot(member, signs[..., None] * signs[..., None, :], (0, 0))
+    sums = np.moveaxis(np.tensordot(of_rows, member, (1, 0)), -1, 1)
     whole = sums.sum(axis=(0, 1))
     own = sums[range(count), range(count)]
     return _tau(np.concatenate([whole[None], whole - sums.sum(axis=0) - sums.sum(axis=1) + own]))
