@@ -1,20 +1,20 @@
 """A release, tried as its users get it: `make test-release`, minutes.
 
-A wheel is built and installed into a new environment, which otherwise has the packages of this one; there, in empty folders,
-the demonstration, the examples of all docstrings, and every command and Python block of the README and the pages run.  The
+A wheel is built and installed into a new environment, which otherwise has the packages of this one; there, in an empty folder,
+the demonstration, every command and Python block of the README and the pages, and the examples of all docstrings run.  The
 scene is the demonstration's, at few steps.
 """
 
-import os
 import re
 import shlex
 import subprocess
 import sys
 import venv
 from pathlib import Path
+from tempfile import mkdtemp
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("landscape", "splat", "analysis", "figures")
+BUILD = ROOT / "build"
 PAGES = (
     "README",
     "docs/first-probe",
@@ -25,28 +25,12 @@ PAGES = (
     "docs/other-tools",
 )
 SHORT = {"train": ["--iterations", "20"], "probe": ["--quick"], "view": ["--html"]}  # words that end a command soon
+BLOCK = re.compile(r"^```python\n(.*?)^```|^    (landscape [^\n]*)$", re.M | re.S)
 
 
 def main() -> None:
     """CalledProcessError at the first thing that fails."""
-    build = ROOT / "build"
-    words = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "--quiet",
-        "--no-deps",
-        "--no-build-isolation",
-        "-w",
-        build / "wheel",
-        ROOT,
-    ]
-    subprocess.run(words, check=True)
-    wheel = max((build / "wheel").glob("*.whl"), key=lambda path: path.stat().st_mtime)
-    binaries = environment(build / "release", wheel)
-    trials = build / f"trials-{os.getpid()}"
-    trials.mkdir()
+    binaries, trials = environment(BUILD / "release"), Path(mkdtemp(prefix="release-"))
 
     def run(*words: object) -> None:
         print("$", shlex.join(map(str, words)), flush=True)
@@ -54,18 +38,19 @@ def main() -> None:
             [binaries / str(words[0]), *map(str, words[1:])], cwd=trials, check=True, stdout=subprocess.DEVNULL
         )
 
-    where = f"import landscape; assert {str(build / 'release')!r} in landscape.__file__, landscape.__file__"
-    run("python", "-c", where)
+    run("python", "-c", f"import landscape; assert {str(BUILD)!r} in landscape.__file__, landscape.__file__")
     run("landscape", "demo", "--out", "demo")
-    run("landscape", "convert", "demo/run", "point_cloud.ply")
-    (trials / "theirs").mkdir()
-    (trials / "point_cloud.ply").rename(trials / "theirs/point_cloud.ply")
-    (trials / "point_cloud.ply").symlink_to("theirs/point_cloud.ply")
+    for file in ("point_cloud.ply", "theirs/point_cloud.ply"):
+        run("landscape", "convert", "demo/run", file)
     for page in PAGES:
-        text = (ROOT / f"{page}.md").read_text(encoding="utf-8")
-        for block in re.findall(r"^```python\n(.*?)^```|^    (landscape [^\n]*)$", text, re.M | re.S):
-            run("python", "-c", block[0]) if block[0] else run(*shortened(block[1], trials))
-    folders = [next((build / "release").glob(f"lib/*/site-packages/{name}")) for name in PACKAGES]
+        for code, command in BLOCK.findall((ROOT / f"{page}.md").read_text(encoding="utf-8")):
+            if code:
+                run("python", "-c", code)
+            elif words := shortened(command, trials):
+                run("landscape", *words)
+    packages = [
+        next((BUILD / "release").glob(f"lib/*/*/{name}")) for name in ("landscape", "splat", "analysis", "figures")
+    ]
     run(
         "python",
         "-m",
@@ -75,32 +60,31 @@ def main() -> None:
         "no:cacheprovider",
         "--import-mode=importlib",
         "--doctest-modules",
-        *folders,
+        *packages,
     )
 
 
-def environment(folder: Path, wheel: Path) -> Path:
+def environment(folder: Path) -> Path:
     """The programs of a new environment with the wheel, which finds the packages of this one, but not this checkout."""
-    venv.EnvBuilder(clear=True, with_pip=False).create(folder)
-    packages = next(folder.glob("lib/*/site-packages"))
-    others = [path for path in sys.path if path.endswith("site-packages")]
-    (packages / "others.pth").write_text("\n".join(others))  # of folders named so no .pth is read
-    python = folder / "bin" / "python"
-    subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", wheel], check=True)
+    words = ["wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir"]
+    subprocess.run([sys.executable, "-m", "pip", *words, BUILD / "wheel", ROOT], check=True)
+    wheel = max((BUILD / "wheel").glob("*.whl"), key=lambda path: path.stat().st_mtime)
+    venv.EnvBuilder(clear=True).create(folder)
+    others = [path for path in sys.path if path.endswith("site-packages")]  # of folders named so no .pth is read
+    (next(folder.glob("lib/*/site-packages")) / "others.pth").write_text("\n".join(others))
+    words = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
+    subprocess.run([folder / "bin/python", *words, wheel], check=True)
     return folder / "bin"
 
 
 def shortened(line: str, trials: Path) -> list[str]:
-    """A command of a page as the demonstration's scene runs it.  A run that another page has made is not made again."""
-    command, *words = shlex.split(
-        line.replace("SCENE", "demo/scene").replace("data/fern", "demo/scene"), comments=True
-    )[1:]
+    """The words of a page's command, for the demonstration's scene; none for a run that another page has made."""
+    command, *words = shlex.split(line.replace("SCENE", "demo/scene"), comments=True)[1:]
     if command == "train" and "--out" not in words:
-        words += ["--out", f"runs/unnamed-{len(list(trials.glob('runs/*')))}"]
-    out = trials / words[words.index("--out") + 1] if "--out" in words else None
-    if out is not None and out.exists():
-        return ["landscape", "--version"]
-    return ["landscape", command, *words, *SHORT.get(command, [])]
+        words += ["--out", mkdtemp(dir=trials) + "/run"]
+    if "--out" in words and (trials / words[words.index("--out") + 1]).exists():
+        return []
+    return [command, *words, *SHORT.get(command, [])]
 
 
 if __name__ == "__main__":
