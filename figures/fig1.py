@@ -1,8 +1,8 @@
 """Figure after the paper's Fig. 1: two landscapes side by side, and what the two scenes look like from a view held out.
 
 `python -m figures.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint along the two
-steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1; dashed: e_2), under the largest
-eigenvalue and by how much it differs from the first run's; below, the photograph of the first view that both have rendered, and
+steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1, e_2), under the largest
+eigenvalue and over that of the first run; below, the photograph of the first view that both have rendered, and
 both renders with their PSNR.  Both share their axes (`figures.manifold`).
 """
 
@@ -17,17 +17,18 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from analysis.console.failures import program
-from analysis.records.quantities import quantity
+from analysis.records.quantities import rough
 from analysis.records.run_files import METRICS, read_scores
 from figures.fig7 import names_of, read_all
 from figures.manifold import Scale, contours, landscape_of, require_same_function, section, surface
 from figures.plane import Plane
 from figures.scripts import runs_script
-from figures.style import BLACK, RUNS, literal, new_figure, style
+from figures.style import BLUE, VERMILION, literal, new_figure, style
 from landscape.errors import InputError
 
 RENDERS, PANELS = "test", "panels"
 WIDTH = 4.8  # inches
+ALONG = {"e₁": VERMILION, "e₂": BLUE}
 
 
 def draw(runs: Sequence[Path]) -> Figure:
@@ -57,8 +58,8 @@ def draw(runs: Sequence[Path]) -> Figure:
             surface(above, (3, 2, 1 + i), landscape, scale, f"{name}: {_steepness(landscape, landscapes[0])}")
             filled = contours(maps[i], landscape, scale)
             across = above.add_subplot(3, 2, 5 + i)
-            section(across, landscape, scale, 0, color=RUNS[i])
-            section(across, landscape, scale, 1, color=RUNS[i], linestyle="--")
+            for axis, colour in enumerate(ALONG.values()):
+                section(across, landscape, scale, axis, color=colour)
             across.set(
                 xlabel=scale.flat_label("e₁, e₂"), ylim=[end / 10.0**scale.loss for end in (scale.low, scale.high)]
             )
@@ -69,19 +70,30 @@ def draw(runs: Sequence[Path]) -> Figure:
                 across.set_ylabel(scale.loss_label)
             else:
                 above.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=MaxNLocator(5))
-        handles = [Line2D([], [], color=BLACK, label="along e₁")]
-        handles.append(Line2D([], [], color=BLACK, linestyle="--", label="along e₂"))
+        handles = [Line2D([], [], color=colour, label=f"along {name}") for name, colour in ALONG.items()]
+        figure.set_label(_caption(names, landscapes))
         above.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure
 
 
 def _steepness(landscape: Plane, first: Plane) -> str:
-    """The largest eigenvalue, and its change against the first run's in percent."""
+    """The largest eigenvalue, and over that of the first run."""
     value, reference = landscape.x.curvature, first.x.curvature
-    words = f"λ = {quantity(value)}"
+    words = f"λ = {rough(value)}"
     if landscape is first or not (value and reference and np.isfinite([value, reference]).all()):
         return words
-    return f"{words} ({100 * (value / reference - 1):+.0f}%)".replace("-", "−")
+    return f"{words} (× {rough(value / reference)})"
+
+
+def _caption(names: Sequence[str], landscapes: Sequence[Plane]) -> str:
+    """What the figure shows, also where it is the opposite of the paper's."""
+    first, second = (each.x.curvature for each in landscapes)
+    way = "flatter" if second < first else "steeper"
+    return (
+        f"The loss around the ends of {names[0]} and {names[1]} along their two steepest directions, in the window that both "
+        f"slices reach: {names[1]} is the {way} one (largest eigenvalue {rough(second)}, {names[0]} {rough(first)}), where the "
+        "paper has StableGS flatter. One training each, which decides no difference."
+    )
 
 
 def _score(run: Path, view: str) -> str:

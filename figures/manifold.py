@@ -1,8 +1,8 @@
 """Recorded slices of several landscapes to one scale, for the figures that compare them.
 
 Every slice is drawn along its own two steepest eigenvectors, but all share their axes: steps in units of the parameters, as far
-as the widest of them reaches, and the change of the loss from its own centre.  So a valley that is narrower looks narrower.
-Where a slice was not recorded that far there is nothing.
+as all of them reach, and the change of the loss from its own centre.  So a valley that is narrower looks narrower, and all that
+is shown was rendered; `landscape slice --radius` renders farther.
 """
 
 import math
@@ -32,7 +32,7 @@ SLICES = (
     ("slice-eigenvectors-2d", SliceRecord),
     ("probe", ProbeRecord),
 )  # beside a checkpoint, the first that is there
-LEVELS = 10
+LEVELS, POINTS = 10, 61  # of a contour plot; of a window, each way
 NAMES = ("e₁", "e₂")
 FUNCTION = {"views": "training views", "sizes": "sizes of the views", "loss": "loss", "background": "background"}
 
@@ -47,9 +47,9 @@ class Scale:
 
     @classmethod
     def of(cls, *landscapes: Plane) -> "Scale":
-        reach = max(float(np.abs(d.steps).max()) for each in landscapes for d in (each.x, each.y))
-        low = min(float(each.rise.min()) for each in landscapes)
-        high = max(float(each.rise.max()) for each in landscapes)
+        reach = min(float(np.abs(d.steps).max()) for each in landscapes for d in (each.x, each.y))
+        shown = [window(each, reach)[1] for each in landscapes]
+        low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
         return cls(reach, low, high if high > low else low + 1.0)
 
     @property
@@ -80,6 +80,16 @@ class Scale:
             ]
         )
         return replace(self, low=min(self.low, float(near.min())), high=max(self.high, float(near.max())))
+
+
+def window(landscape: Plane, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Steps up to `reach`, POINTS each way, and the change of the loss there [along x, along y], linear between the grid's.
+
+    nan next to a loss that is not finite.
+    """
+    steps, rise = np.linspace(-reach, reach, POINTS), landscape.rise.filled(np.nan)
+    across = np.stack([np.interp(steps, landscape.x.steps, line) for line in rise.T])
+    return steps, np.stack([np.interp(steps, landscape.y.steps, line) for line in across.T])
 
 
 def require_same_function(runs: Sequence[Path]) -> None:
@@ -147,8 +157,9 @@ def surface(
     """The loss as a surface over both steps: its axes, and its colours."""
     axes: Axes3D = figure.add_subplot(*place, projection="3d")  # pyright: ignore[reportAssignmentType]
     steps, loss = 10.0**scale.steps, 10.0**scale.loss
-    x, y = np.meshgrid(landscape.x.steps / steps, landscape.y.steps / steps, indexing="ij")
-    height = landscape.rise.filled(np.nan) / loss
+    along, rise = window(landscape, scale.reach)
+    x, y = np.meshgrid(along / steps, along / steps, indexing="ij")
+    height = rise / loss
     low, high = scale.low / loss, scale.high / loss
     drawn = axes.plot_surface(x, y, height, cmap=FIELD_MAP, rcount=60, ccount=60, linewidth=0.1, vmin=low, vmax=high)
     reach = scale.reach / steps

@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from analysis.records.records import ProbeRecord, read_record
-from figures.style import SUFFIXES, save
+from figures.style import PAPER, SUFFIXES, save
 from landscape.errors import InputError
 
 
@@ -76,8 +76,9 @@ def runs_script(draw: Callable[[Sequence[Path]], Figure], name: str) -> int:
         "runs", type=Path, nargs=2, metavar="RUN", help="folders of landscape train: 3DGS, then StableGS"
     )
     parser.add_argument("--out", type=Path, default=Path(f"{name}.png"), help="PNG, PDF or SVG, by its suffix")
-    options = parser.parse_args()
-    return print_files(lambda: [save(draw(options.runs), options.out)])
+    options = _add_paper(parser).parse_args()
+    out = options.out.with_suffix(f".{options.format}") if options.format else options.out
+    return print_files(lambda: [save(draw(options.runs), out)])
 
 
 def print_files(draw: Callable[[], Iterable[Path]]) -> int:
@@ -93,3 +94,10 @@ def print_files(draw: Callable[[], Iterable[Path]]) -> int:
 
 def _add_format(parser: ArgumentParser) -> None:
     parser.add_argument("--format", choices=SUFFIXES, default="png")
+    _add_paper(parser)
+
+
+def _add_paper(parser: ArgumentParser) -> ArgumentParser:
+    words = f"as a paper has it: NAME{PAPER}, columns wide, serif, panels lettered, the caption beside it"
+    parser.add_argument("--paper", dest="format", action="store_const", const=PAPER[1:], help=words)
+    return parser

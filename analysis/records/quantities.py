@@ -107,10 +107,10 @@ def percent(share: float) -> str:
 def ratio(aspect: float) -> str:
     """Aspect ratio, length to width.
 
-    >>> ratio(20.8), ratio(3.14)
-    ('21 : 1', '3.1 : 1')
+    >>> ratio(1465.0), ratio(20.8), ratio(3.14)
+    ('1500 : 1', '21 : 1', '3.1 : 1')
     """
-    return f"{aspect:.{0 if aspect > 10 else 1}f} : 1"
+    return f"{rough(aspect)} : 1"
 
 
 def limits(low: float | None, high: float | None, between: str = " … ") -> str:

@@ -11,9 +11,10 @@ import pytest
 from matplotlib.colors import to_hex
 from PIL import Image
 
+from analysis.records.quantities import rough
 from analysis.records.records import Record, SliceRecord, read_record, record_folder, write_record
 from figures import fig1, fig7
-from figures.manifold import Scale, landscape_of, start_of
+from figures.manifold import Scale, landscape_of, start_of, window
 from figures.scripts import runs_script
 from figures.style import RUNS
 from tests.figures.test_figures import POINT, laid_out
@@ -80,13 +81,17 @@ def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
     figure = fig7.draw(runs)
     surfaces = [axes for axes in figure.axes if hasattr(axes, "get_zlim")]
     assert len(surfaces) == 3
-    widest = landscape_of(runs[1])
-    reach = float(np.abs(widest.y.steps).max())  # of the flattest direction of the flattest landscape
+    tightest = landscape_of(runs[0])
+    reach = float(np.abs(tightest.x.steps).max())  # of the steepest direction of the steepest landscape: all reach it
     assert Scale.of(*map(landscape_of, runs)).reach == reach
+    assert all(np.isfinite(window(landscape_of(run), reach)[1]).all() for run in runs)
+    assert window(tightest, reach)[1][30, 30] == 0 and window(tightest, reach)[1][-1, 30] == pytest.approx(
+        tightest.through_centre(tightest.rise, 0)[-1]
+    )
     ends = {(axes.get_xlim(), axes.get_ylim(), axes.get_zlim()) for axes in surfaces[:2]}  # pyright: ignore[reportAttributeAccessIssue]
     assert len(ends) == 1
     wide = Scale.of(start_of(runs[0]))
-    assert surfaces[2].get_title().startswith(f"start, steps × {wide.reach / reach:.2g}\n")
+    assert surfaces[2].get_title().startswith(f"start, steps × {rough(wide.reach / reach)}\n")
     assert surfaces[2].get_xlim()[1] == pytest.approx(wide.reach / 10.0**wide.steps)
     across, along = figure.axes[-2:]
     assert across.get_xlim() == along.get_xlim()
@@ -141,6 +146,25 @@ def test_a_figure_makes_the_folder_that_it_is_written_to(runs, tmp_path, monkeyp
     monkeypatch.setattr(sys, "argv", ["fig1", *map(str, runs), "--out", str(tmp_path / "paper/figures/one.svg")])
     assert runs_script(fig1.draw, "fig1") == 0
     assert (tmp_path / "paper/figures/one.svg").is_file()
+
+
+@pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
+def test_for_a_paper_titles_are_letters_and_the_caption_lies_beside_it(runs, tmp_path, monkeypatch, module):
+    drawn = []
+    monkeypatch.setattr(sys, "argv", ["figure", *map(str, runs), "--out", str(tmp_path / "one.png"), "--paper"])
+    assert runs_script(lambda each: drawn.append(module.draw(each)) or drawn[0], "figure") == 0
+    written = (tmp_path / "one.paper.pdf").read_bytes()
+    assert written.startswith(b"%PDF") and b"STIX" in written and round(drawn[0].get_figwidth(), 1) == 6.9
+    titles = [axes.get_title(side) for axes in drawn[0].axes for side in ("left", "center", "right")]
+    letters = [title for title in titles if title]
+    assert sorted(letters) == [f"({letter})" for letter in "abcdef"][: len(letters)] and len(letters) >= 4
+    caption = (tmp_path / "one.paper.txt").read_text()
+    assert "(a) " in caption and caption.count("\n") == 1
+    if module is fig1:
+        assert "(a) 3dgs: λ = " in caption and "(d) stablegs not scored." in caption  # as they are read
+        assert (
+            "stablegs is the flatter one" in caption and "where the paper has StableGS flatter. One training" in caption
+        )
 
 
 def test_the_index_is_the_recorded_one_of_each_run(runs):
