@@ -3,6 +3,8 @@
     RUN/checkpoint.pt           the latest checkpoint (`splat/training/checkpoint.py`), written at the start, every
                                 --checkpoint-every steps, on Ctrl-C and at the end
     RUN/step-N/checkpoint.pt    with --keep-checkpoints: the latest ones, by step; a probe of one writes beside it
+    RUN/psnr-X/checkpoint.pt    with --save-at-psnr: the first, of those that are looked at every LOOK steps, whose training
+                                views have X dB, by the mean of their squared errors; absent where none has
     RUN/train.csv               progress (`analysis/train/progress.py`)
     RUN/seconds.json            time of the steps (`analysis/train/training_time.py`)
     RUN/history.csv             notes of the training method, a row each with its "step"; absent without any
@@ -21,6 +23,7 @@ import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from math import inf
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,7 +36,7 @@ from analysis.console.overrides import assignments, overridden
 from analysis.console.plain import say
 from analysis.records.run_files import CHECKPOINT
 from analysis.train.options import TrainOptions
-from analysis.train.progress import TrainingProgress, tracker_module
+from analysis.train.progress import TrainingProgress, scored, tracker_module
 from analysis.train.remarks import begins, remarks
 from analysis.train.scores import report
 from analysis.train.source import from_checkpoint
@@ -61,7 +64,8 @@ from splat.training.score.evaluate import have_masks
 from splat.training.start import Source, initial_gaussians
 from splat.training.state import TrainConfig, Training
 
-HISTORY, KEPT = "history.csv", "step-{}"
+HISTORY, KEPT, REACHED = "history.csv", "step-{}", "psnr-{:g}"
+LOOK = 50  # steps between two looks at the training views' PSNR
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 OPTIONS = {  # settings of the training that have an option besides --set
     "iterations": "iterations",
@@ -119,6 +123,16 @@ class Run:
                 if not any(folder.iterdir()):  # a probe of the checkpoint may lie there
                     folder.rmdir()
 
+    def save_reached(self, levels: Sequence[float]) -> None:
+        """Keep the checkpoint for each level that the training views reach now and did not before."""
+        pending = [level for level in levels if not (self.out / REACHED.format(level) / CHECKPOINT).exists()]
+        if pending:
+            errors = [10 ** (-scored(self.training, view)[1] / 10) for view in self.views]
+            mean = sum(errors) / len(errors)
+            for level in pending:
+                if mean <= 10 ** (-level / 10):
+                    self._save_within(self.out / REACHED.format(level))
+
     def _save_within(self, folder: Path) -> None:
         folder.mkdir(exist_ok=True)
         deeper = replace(self.reference, relative=os.path.join(os.pardir, self.reference.relative))
@@ -130,6 +144,8 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     for name in ("checkpoint_every", "log_every"):
         if (value := getattr(options, name)) < 1:
             raise InputError(f"expected {name} of at least 1, got {value}")
+    if not all(0 < level < inf for level in options.save_at_psnr or ()):
+        raise InputError(f"expected save_at_psnr in dB above 0, got {' '.join(map(str, options.save_at_psnr or ()))}")
     if options.keep_checkpoints != "all" and options.keep_checkpoints < 0:
         raise InputError(f"expected keep_checkpoints of at least 0, or all, got {options.keep_checkpoints}")
     if options.track:
@@ -286,6 +302,8 @@ def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, cons
             progress.after_step(done, spent)
             if trajectory:
                 trajectory.after_step(spent.wall)
+            if done.step % LOOK == 0:
+                run.save_reached(options.save_at_psnr or ())
             stop = interrupted.is_set()
             due = done.step % options.checkpoint_every == 0 or done.step == total
             if stop or due:

@@ -69,6 +69,8 @@ class TrainOptions:
     """Steps between checkpoints."""
     keep_checkpoints: Annotated[int | Literal["all"], arg(metavar="N")] = 0
     """How many stay as OUT/step-K, or all."""
+    save_at_psnr: Annotated[tuple[float, ...] | None, arg(metavar="DB ...")] = None
+    """Keep OUT/psnr-DB once the training views are as good."""
     log_every: int = 100
     """Steps between rows of OUT/train.csv."""
     track: Annotated[Literal["tensorboard", "wandb", "trackio"] | None, arg(metavar="NAME")] = None

@@ -202,8 +202,8 @@ def _text(value: Any) -> str:
 def arguments(command: str, options: TrainOptions | ProbeOptions) -> list[str]:
     """The words of the command line that say the same as the options.
 
-    >>> arguments("train", TrainOptions(Path("fern"), out=Path("runs/fern"), densify=False, set=("gamma=0.5",)))
-    ['train', 'fern', '--out', 'runs/fern', '--set', 'gamma=0.5', '--no-densify']
+    >>> arguments("train", TrainOptions(Path("fern"), densify=False, set=("gamma=0.5",), save_at_psnr=(30, 33)))
+    ['train', 'fern', '--set', 'gamma=0.5', '--no-densify', '--save-at-psnr', '30', '33']
     """
     positional, *named = fields(options)
     return [command, str(getattr(options, positional.name)), *_words(options, named)]
@@ -221,7 +221,8 @@ def _words(options: Any, named: Sequence[Field]) -> list[str]:
             continue
         if isinstance(value, bool):
             words.append(f"--{option}" if value else f"--no-{option}")
+        elif option == "set":
+            words += [word for each in value for word in (f"--{option}", each)]
         else:
-            for each in value if isinstance(value, tuple) else [value]:
-                words += [f"--{option}", str(each)]
+            words += [f"--{option}", *map(str, value if isinstance(value, tuple) else [value])]
     return words

@@ -50,6 +50,35 @@ def test_what_is_kept_is_the_checkpoint_of_its_step_and_finds_its_scene(original
     assert (run / "step-25" / kept.scene.relative).resolve() == original.resolve()
 
 
+def test_the_first_checkpoint_whose_training_views_reach_a_level_stays(original, run, tmp_path, monkeypatch):
+    """By the mean of the squared errors, looked at every few steps; a level that is not reached has no folder."""
+
+    def level(step: int) -> float:
+        path = run / f"step-{step}" / "checkpoint.pt"
+        loaded = load_checkpoint(path)
+        training, views = loaded.training, loaded.with_scene(path).scene.load(loaded.scene.train)
+        errors = []
+        for view in views:
+            with torch.no_grad():
+                image = render(training.gaussians, view.camera, torch.zeros(3), training.config.render).image
+            errors.append((image.clamp(0, 1) - view.image).square().mean())
+        return float(-10 * torch.stack(errors).mean().log10())
+
+    monkeypatch.setattr(command, "LOOK", 10)
+    low, high = level(10), level(20)
+    assert low < high
+    asked = [f"{low - 0.5:.6g}", f"{(low + high) / 2:.6g}", "99"]
+    out = tmp_path / "run"
+    assert main(words(original, out, "--save-at-psnr", *asked)) == 0
+    kept = {path.name: load_checkpoint(path / "checkpoint.pt") for path in out.glob("psnr-*")}
+    assert {name: each.training.step for name, each in kept.items()} == {f"psnr-{asked[0]}": 10, f"psnr-{asked[1]}": 20}
+    same = load_checkpoint(run / "step-20" / "checkpoint.pt").training.gaussians.flat
+    assert torch.equal(kept[f"psnr-{asked[1]}"].training.gaussians.flat, same)  # a look changes nothing
+    before = (out / f"psnr-{asked[0]}" / "checkpoint.pt").read_bytes()
+    assert main(words(original, out, "--save-at-psnr", *asked, "--resume")) == 0
+    assert (out / f"psnr-{asked[0]}" / "checkpoint.pt").read_bytes() == before
+
+
 def test_the_oldest_of_those_that_stay_go_but_for_what_else_is_in_their_folders(original, tmp_path, monkeypatch):
     out = tmp_path / "run"
 
@@ -138,6 +167,7 @@ def test_other_trackers_are_given_the_rows_by_the_calls_that_they_share(original
         (["--track", "tensorboard"], "pip install tensorboard"),
         (["--track", "trackio"], "pip install trackio"),
         (["--keep-checkpoints", "-1"], "expected keep_checkpoints of at least 0, or all, got -1"),
+        (["--save-at-psnr", "30", "-1"], "expected save_at_psnr in dB above 0, got 30.0 -1.0"),
         (["--log-every", "0"], "expected log_every of at least 1, got 0"),
     ],
 )

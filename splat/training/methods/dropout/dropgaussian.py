@@ -32,8 +32,13 @@ class DropGaussian(MethodSettings):
 
 class DropGaussianMethod(Method[DropGaussian]):
     def opacity_scale(self, step: Step) -> Float[Tensor, " n"]:
-        p = self.settings.p_max * step.number / step.config.iterations
-        return dropout(len(step.gaussians), p, step.gaussians.flat.dtype, self.generator) / (1 - p)
+        return rising_dropout(step, self.settings.p_max, self.generator)
+
+
+def rising_dropout(step: Step, p_max: float, generator: torch.Generator) -> Float[Tensor, " n"]:
+    """The scales of the opacities at a step, as above."""
+    p = p_max * step.number / step.config.iterations
+    return dropout(len(step.gaussians), p, step.gaussians.flat.dtype, generator) / (1 - p)
 
 
 def dropout(n: int, p: float, dtype: torch.dtype, generator: torch.Generator) -> Float[Tensor, " n"]:

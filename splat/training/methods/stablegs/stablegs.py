@@ -69,6 +69,7 @@ from splat.render.render import render_depth
 from splat.scenes.view import View
 from splat.training.densify import DensifySettings
 from splat.training.methods.agreement import agreement
+from splat.training.methods.dropout.dropgaussian import rising_dropout
 from splat.training.methods.stablegs.attribute_probe import (
     DRAWN,
     Attribute,
@@ -99,6 +100,8 @@ class StableGS(MethodSettings):
     ten Gaussian samples a block, in each.
     accuracy: of rho with "exact" traces, relative, with 95% confidence; inf takes the fewest samples, four.
     densify_after_warm_up: Gaussians are cloned, split and removed only after the warm-up.
+    drop_share: p_max of DropGaussian, which leaves Gaussians out of the sampled view's render from the first step on; not the
+    paper's, and 0 by default: with both weights 0 the training is DropGaussian's.
     probe, viewpoint: of the attribute probes and of the viewpoint probes.  The others: see above.
     """
 
@@ -116,6 +119,7 @@ class StableGS(MethodSettings):
     vsp_share: Annotated[float, Meta(gt=0, le=1)] = 1.0
     antithetic: bool = True
     densify_after_warm_up: bool = False
+    drop_share: Annotated[float, Meta(ge=0, lt=1)] = 0.0
     probe: ProbeSettings = field(default_factory=ProbeSettings)
     viewpoint: ViewpointSettings = field(default_factory=ViewpointSettings)
 
@@ -168,6 +172,10 @@ class StableGSMethod(Method[StableGS]):
                 f"expected an edge's normal for each of {len(views)} training views, found {len(self.normals)} in the saved "
                 "training; take another copy of it, or train anew"
             )
+
+    def opacity_scale(self, step: Step) -> Float[Tensor, " n"] | None:
+        share = self.settings.drop_share
+        return rising_dropout(step, share, self.generator) if share else None
 
     def gradient(self, step: Step, base: LossAndGradient) -> LossAndGradient:
         settings = self.settings

@@ -138,6 +138,14 @@ def test_normals_of_other_views_are_refused_before_the_first_step(tmp_path, save
 NOTHING = [StableGS(warm_up=3, asp_weight=0.0, vsp_weight=0.0), CoRGS(prune_every=0, weight=0.0)]
 
 
+def test_stablegs_without_its_probes_can_drop_gaussians_as_dropgaussian_does():
+    dropped, other = (
+        trained(replace(tiny_config(), method=method), views=views())
+        for method in (StableGS(warm_up=3, asp_weight=0.0, vsp_weight=0.0, drop_share=0.4), DropGaussian(p_max=0.4))
+    )
+    assert torch.equal(dropped.gaussians.flat, other.gaussians.flat)
+
+
 @pytest.mark.parametrize("off", [*NOTHING, FSGS(unpool_until=0, depth_weight=0.0)])
 def test_a_method_of_which_all_is_switched_off_is_3dgs_bit_for_bit(off, plain):
     other = trained(replace(tiny_config(), method=off), views=views())
