@@ -25,6 +25,7 @@ from landscape.errors import InputError
 from splat.model.files.quantised import turned
 from splat.model.files.splat_file import logit
 from splat.model.gaussians import Gaussians
+from splat.model.harmonics import Y00
 from splat.render.render import render
 from splat.scenes.images import resize_by_area
 from splat.scenes.scene import Scene
@@ -68,6 +69,7 @@ def mistaken(reading: Reading) -> Iterator[Reading]:
     yield read("quaternions that turn Gaussians into the world", "their inverses", quats=g.quats * INVERSE)
     yield read("axes right, down, front", "right, up, back", turned(g))
     yield read("colours red, green, blue", "blue, green, red", sh=g.sh.flip(-1))
+    yield read("SH coefficients", "colours from 0 to 1", sh=torch.cat([(colours - 0.5) / Y00, higher], 1))
     if higher.numel():
         bands = higher.transpose(1, 2).reshape(higher.shape)
         yield read("all f_rest of red, then of green, then of blue", "band by band", sh=torch.cat([colours, bands], 1))

@@ -11,6 +11,7 @@ import torch
 from splat.model.files.quantised import turned
 from splat.model.files.splat_ply import splat_ply
 from splat.model.gaussians import Gaussians
+from splat.model.harmonics import Y00
 from splat.render.render import render
 from splat.scenes.scene import load_scene
 from splat.scenes.view import View
@@ -63,6 +64,7 @@ MISTAKEN = {
     "got their inverses": with_(quats=TRUE.quats * BACK),
     "axes right, down, front, got right, up, back": turned(TRUE),
     "colours red, green, blue, got blue, green, red": with_(sh=TRUE.sh.flip(-1)),
+    "SH coefficients, got colours": with_(sh=torch.cat([TRUE.sh[:, :1] * Y00 + 0.5, TRUE.sh[:, 1:]], dim=1)),
     "f_rest .*, got band by band": with_(sh=by_bands(TRUE.sh)),
     "logits of opacities, got opacities": with_(opacity_logits=TRUE.opacity_logits.sigmoid()),
     "logarithms of scales, got scales": with_(log_scales=TRUE.log_scales.exp()),
