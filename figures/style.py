@@ -98,7 +98,7 @@ def for_paper(figure: Figure) -> str:
             part.suptitle("")
     for text in figure.findobj(Text):
         text.set_fontfamily(PAPER_FONTS)
-    return " ".join(" ".join([figure.get_label(), *said]).replace(r"\$", "$").split())
+    return " ".join(" ".join([str(figure.get_label()), *said]).replace(r"\$", "$").split())
 
 
 def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:

@@ -234,13 +234,18 @@ def verdict(losses: pd.DataFrame) -> str:
     >>> verdict(seeds.assign(opacity=[0.25, 0.351])).split()[1:6]
     ['loses', '0.0505', '±', '0.0064', 'dB']
     """
-    best = min(EXACT, key=lambda name: losses[name].mean())
-    gain, n = losses["opacity"] - losses[best], len(losses)
-    error = t_quantile(n - 1, 0.95) * float(gain.std()) / n**0.5 if n > 1 else 0.0
-    if abs(gain.mean()) <= error:
+    by = {name: losses[name].to_numpy(float) for name in SCORES}
+    best, n = min(EXACT, key=lambda name: float(by[name].mean())), len(losses)
+    gain, deviation = _over_seeds(by["opacity"] - by[best])
+    error = t_quantile(n - 1, 0.95) * deviation / n**0.5 if deviation is not None else 0.0
+    if abs(gain) <= error:
         return f"{best} and opacity: undecided over {n} seeds"
-    than = "less" if gain.mean() > 0 else "more"
-    return f"{best} loses {quantity(abs(gain.mean()), error)} dB {than} than opacity"
+    return f"{best} loses {quantity(abs(gain), error)} dB {'less' if gain > 0 else 'more'} than opacity"
+
+
+def _over_seeds(values: Float64[np.ndarray, " n"]) -> tuple[float, float | None]:
+    """Mean and standard deviation; None of a single one."""
+    return float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else None
 
 
 def _conclude(
@@ -260,7 +265,7 @@ def _conclude(
         table.add_column(title, justify="left" if title == "score" else "right")
     losses = [lost(curve, *at, measure) for at in columns] if curve is not None else []
     for name in SCORES:
-        cells = [quantity(loss[name].mean(), loss[name].std() if len(loss) > 1 else None) for loss in losses]
+        cells = [quantity(*_over_seeds(loss[name].to_numpy(float))) for loss in losses]
         table.add_row(name, quantity(ranks.loc[TRUTH, name]), *cells)
     Console().print(table)
     for (removed, steps), loss in zip(columns, losses, strict=True):
