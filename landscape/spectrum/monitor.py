@@ -9,7 +9,6 @@ The columns are those of `landscape train --probe-every`.  Traces are those of G
 are of the Hessian, with the errors of its products; indices are left empty.
 """
 
-import csv
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -93,10 +92,9 @@ class Monitor:
 
     def _write(self) -> None:
         """Write all rows to a file beside the table, then put it in its place."""
+        import pandas as pd  # slow to import
+
         names = dict.fromkeys((*COLUMNS, *(name for row in self.rows for name in row)))
         partial = self.path.with_suffix(".partial")
-        with partial.open("w", newline="", encoding="utf-8") as stream:
-            table = csv.DictWriter(stream, list(names))
-            table.writeheader()
-            table.writerows(self.rows)
+        pd.DataFrame(self.rows, columns=list(names)).to_csv(partial, index=False)
         os.replace(partial, self.path)
