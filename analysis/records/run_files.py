@@ -156,11 +156,6 @@ class Steepest(Struct, kw_only=True):
     sentence: str
     rendered: str = ""
 
-    @property
-    def is_refuted(self) -> bool:
-        """Whether it was rendered and no step changed the loss to the side that the curvature says."""
-        return bool(self.factors) and max(self.factors) <= 0
-
 
 class Swaps(Struct, kw_only=True):
     """Effect of Gaussians changing places with those next in front of them, on their rays.
