@@ -12,7 +12,7 @@ STAMP := $(VENV)/.installed
 TOOLS := $(VENV)/.tools-installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: setup demo test test-everywhere test-release docs clean
+.PHONY: setup demo test types pytest test-everywhere test-release docs clean
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
@@ -33,7 +33,12 @@ demo: setup
 test: $(TOOLS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	@$(MAKE) --no-print-directory --jobs 2 types pytest
+
+types:  # of one core, beside the tests
 	$(BIN)/pyright
+
+pytest:
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
 test-everywhere: $(TOOLS)
