@@ -101,7 +101,7 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
         ends = place[0] / 10.0**field.x.exponent, place[1] / 10.0**field.y.exponent
         axes.plot(*ends, "x", color=VERMILION, markersize=5, markeredgewidth=1.2)
     axes.set_xlabel(field.x.label)
-    axes.set_ylabel(field.y.label)
+    axes.set_ylabel(field.y.label if field.y.scale != field.x.scale else field.y.short_label)
     if same := same_scale(np.ptp(field.x.steps), np.ptp(field.y.steps)):
         axes.set_aspect(10.0 ** (field.y.exponent - field.x.exponent))
     axes.set_title("The plane of both" + ("" if same else " (axes differ in scale)"), loc="left")
