@@ -49,18 +49,21 @@ def test_the_stored_table_holds_what_is_asked_and_the_page_quotes_it():
     table = pd.read_csv(command.RESULTS)
     assert command.page(table) in (ROOT / "docs" / "why-finite-differences-fail.md").read_text()
     ends = table[table["part"] == "ends"]
-    assert (ends[ends["way"] == "gauss_newton"]["error"] < 0.005).all() and (ends["way"] == "gauss_newton").any()
-    assert ends[(ends["scene"] == "fern") & (ends["way"] == "naive")]["error"].min() > 0.5
+    gauss_newton = pd.DataFrame(ends[ends["way"] == "gauss_newton"])["error"]
+    assert len(gauss_newton) and max(gauss_newton) < 0.005
+    assert pd.Series(ends[(ends["scene"] == "fern") & (ends["way"] == "naive")]["error"]).min() > 0.5
     split = table[(table["way"] == "split") & table["part"].isin(["products", "ends"]) & (table["scene"] != "fern")]
-    sizes = split.groupby(["scene", "type"])[["of", "within"]].sum()  # of fern's full size there are few
+    sizes = pd.DataFrame(
+        pd.DataFrame(split).groupby(["scene", "type"])[["of", "within"]].sum()
+    )  # fern's full size has few
     assert set(sizes.index) == {
         ("demo", "float64"),
         ("demo", "float32"),
         ("surfels", "float64"),
         ("fern-126x94", "float32"),
     }
-    assert (sizes["of"] >= 60).all() and (sizes["within"] >= 0.9 * sizes["of"]).all()
-    for _, cover in table[table["part"] == "cover"].groupby("scene"):
+    assert min(sizes["of"]) >= 60 and min(sizes["within"] - 0.9 * sizes["of"]) >= 0
+    for _, cover in pd.DataFrame(table[table["part"] == "cover"]).groupby("scene"):
         of, within = np.asarray(cover[["of", "within"]], dtype=float).sum(axis=0)
         assert of >= 500 and 0.925 <= within / of <= 0.98
     trained = table[(table["part"] == "traces") & (table["scene"] == "fern")]
