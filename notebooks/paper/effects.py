@@ -134,7 +134,8 @@ def gain(rows: pd.DataFrame, method: str, over: str = BASE) -> Interval:
     each = table.sub(table[over], axis=0).drop(columns=over)
     freedom = int((each.count() - 1).clip(lower=0).sum())
     deviation = float(np.sqrt(np.nansum((each - each.mean()) ** 2) / max(freedom, 1)))
-    return Interval.of(each.get(method, []), (deviation, freedom) if freedom else None)
+    values = pd.Series(each[method]) if method in each else []
+    return Interval.of(values, (deviation, freedom) if freedom else None)
 
 
 def log_ratios(rows: pd.DataFrame, name: str, method: str = STABLE) -> pd.Series:

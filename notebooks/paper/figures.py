@@ -239,7 +239,7 @@ def _of_predictors(related: pd.DataFrame) -> str:
         named = [
             f"{words_of(row['quantity'])} ({row['tau']:+.2f}, {row['low']:+.2f} to {row['high']:+.2f})" for row in best
         ]
-        tried = int((related["kind"] == kind).sum())
+        tried = list(related["kind"]).count(kind)
         found.append(f"{words}: {', '.join(named) or 'none'} of {tried}")
     return f"Goes with PSNR on held-out views after Holm's correction, {'; '.join(found)}. Correlation is not cause."
 

@@ -48,7 +48,7 @@ def predictors(rows: pd.DataFrame) -> pd.DataFrame:
     """
     table = pd.DataFrame(_lines(rows), columns=[name for name in COLUMNS if name != "holm"])
     table["holm"] = table.groupby("kind")["p"].transform(holm)
-    return table[list(COLUMNS)]
+    return table.reindex(columns=list(COLUMNS))
 
 
 def _lines(rows: pd.DataFrame) -> Iterator[dict]:
@@ -58,8 +58,8 @@ def _lines(rows: pd.DataFrame) -> Iterator[dict]:
             continue
         # machines repeat a training, and a method with one seed has no share in `within`
         keys, columns = ["scene", "method", "seed"], [*dict.fromkeys([name, SCORE, *controls])]
-        known = rows[keys + columns].dropna().groupby(keys, sort=False).mean().reset_index()
-        known = pd.DataFrame(known[known.groupby(keys[:2])[SCORE].transform("size") > 1])
+        once = pd.DataFrame(rows[keys + columns].dropna().groupby(keys, sort=False).mean())
+        known = once.reset_index().groupby(keys[:2], sort=False).filter(lambda runs: len(runs) > 1)
         scenes, methods = (pd.factorize(known[key])[0] for key in keys[:2])
         for kind, given in {"all": [], "given": controls, "within": []}.items():
             values = known[[name, SCORE, *given]].to_numpy(float)
@@ -124,7 +124,7 @@ def _tau(sums: np.ndarray) -> np.ndarray:
     0.25
     """
     sizes = np.sqrt(np.diagonal(sums, axis1=-2, axis2=-1))
-    varies = (sizes > 0).all(axis=tuple(range(sizes.ndim - 1)))  # what does not vary conditions nothing
+    varies = np.all(sizes.reshape(-1, sizes.shape[-1]) > 0, axis=0)  # what does not vary conditions nothing
     if not varies[:2].all():
         return np.full(sums.shape[:-2], np.nan)
     taus = (sums / (sizes[..., None] * sizes[..., None, :]).clip(1e-300))[..., varies, :][..., varies]

@@ -59,7 +59,7 @@ def test_the_curve_scores_what_is_left(curved):
     curve, loaded = pd.read_csv(curved / "curve.csv"), load_checkpoint(curved / "checkpoint.pt")
     assert {*curve.score} == {*SCORES} and len(curve) == len(SCORES) * (len(prune.REMOVED) + 3 * len(prune.REFINED))
     lost = prune.lost(curve, 0.9, 2, "train_psnr")
-    assert lost.shape == (3, len(SCORES)) and lost["opacity"].nunique() == 3  # seeds
+    assert lost.shape == (3, len(SCORES)) and len({*lost["opacity"]}) == 3  # seeds
     path, views = curved / "checkpoint.pt", loaded.scene
     kept = evaluate(loaded.training.gaussians, loaded.with_scene(path).scene.load(views.test))
     row = curve[(curve.score == "opacity") & (curve.removed == 0.6) & (curve.steps == 0)].iloc[0]
