@@ -74,7 +74,7 @@ def finding(direction: Direction, change: np.ndarray, model: np.ndarray | None) 
     ratio = found / said
     if 1 / AGREES <= ratio <= AGREES:
         return f"{along} changes\nas its curvature says"
-    words = f"{rough(ratio)} of what its\ncurvature says" if ratio > 0 else "against its curvature"
+    words = f"{rough(ratio)} times what\nits curvature says" if ratio > 0 else "against its curvature"
     return f"{along} {'rises' if found > 0 else 'falls'},\n{words}"
 
 

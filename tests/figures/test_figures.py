@@ -211,7 +211,7 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     ("ratio", "said"),
     [
         (1.1, "changes as its curvature says"),
-        (0.14, "rises, 0.14 of what its curvature says"),
+        (0.14, "rises, 0.14 times what its curvature says"),
         (-2.0, "falls, against its curvature"),
     ],
 )
