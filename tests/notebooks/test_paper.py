@@ -15,7 +15,7 @@ from tests.notebooks.test_claims import NAMES, OTHERWISE, PAPER, made_up
 
 def test_captions_change_with_the_numbers():
     ours, other = captions(made_up(PAPER), NAMES), captions(made_up(OTHERWISE), NAMES)
-    assert ours.count("**holds.**") == 9 and other.count("**does not hold.**") == 9
+    assert ours.count("**holds.**") == 10 and other.count("**does not hold.**") == 10
     assert "**index.**" not in ours  # not drawn
     missing = (
         "all probes, one viewpoint",
