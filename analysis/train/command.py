@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from math import inf
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal
 
 import pandas as pd
@@ -82,7 +83,10 @@ AGAIN = "repeat its command with --resume, or choose another --out"
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A training with its scene, its views and its folder.  keep: number of checkpoints that are kept besides the latest."""
+    """A training with its scene, its views and its folder.
+
+    keep: number of checkpoints that are kept besides the latest; levels: dB of the training views at which one more is.
+    """
 
     out: Path
     training: Training
@@ -91,6 +95,7 @@ class Run:
     held_out: list[View]
     reference: SceneReference
     keep: int | Literal["all"] = 0
+    levels: Sequence[float] = ()
 
     @property
     def fingerprint(self) -> Fingerprint:
@@ -123,14 +128,13 @@ class Run:
                 if not any(folder.iterdir()):  # a probe of the checkpoint may lie there
                     folder.rmdir()
 
-    def save_reached(self, levels: Sequence[float]) -> None:
-        """Keep the checkpoint for each level that the training views reach now and did not before."""
-        pending = [level for level in levels if not (self.out / REACHED.format(level) / CHECKPOINT).exists()]
+    def save_reached(self) -> None:
+        """Keep the checkpoint for each of the levels that the training views reach now and did not before."""
+        pending = [level for level in self.levels if not (self.out / REACHED.format(level) / CHECKPOINT).exists()]
         if pending:
-            errors = [10 ** (-scored(self.training, view)[1] / 10) for view in self.views]
-            mean = sum(errors) / len(errors)
+            error = fmean(10 ** (-scored(self.training, view)[1] / 10) for view in self.views)
             for level in pending:
-                if mean <= 10 ** (-level / 10):
+                if error <= 10 ** (-level / 10):
                     self._save_within(self.out / REACHED.format(level))
 
     def _save_within(self, folder: Path) -> None:
@@ -144,8 +148,9 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     for name in ("checkpoint_every", "log_every"):
         if (value := getattr(options, name)) < 1:
             raise InputError(f"expected {name} of at least 1, got {value}")
-    if not all(0 < level < inf for level in options.save_at_psnr or ()):
-        raise InputError(f"expected save_at_psnr in dB above 0, got {' '.join(map(str, options.save_at_psnr or ()))}")
+    levels = options.save_at_psnr or ()
+    if not all(0 < level < inf for level in levels):
+        raise InputError(f"expected save_at_psnr in dB above 0, got {' '.join(map(str, levels))}")
     if options.keep_checkpoints != "all" and options.keep_checkpoints < 0:
         raise InputError(f"expected keep_checkpoints of at least 0, or all, got {options.keep_checkpoints}")
     if options.track:
@@ -170,7 +175,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         training = Training.start(given, scene.extent(split.train), config)
     training.move(device)
     prepare(training, views)  # refuses what cannot be trained before there is a folder
-    run = Run(out, training, scene, views, held_out, reference, options.keep_checkpoints)
+    run = Run(out, training, scene, views, held_out, reference, options.keep_checkpoints, levels)
     if not out.parent.exists():
         out.parent.mkdir(parents=True, exist_ok=True)
     with locked(beside(out), f"no other training in {out}"):
@@ -303,7 +308,7 @@ def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, cons
             if trajectory:
                 trajectory.after_step(spent.wall)
             if done.step % LOOK == 0:
-                run.save_reached(options.save_at_psnr or ())
+                run.save_reached()
             stop = interrupted.is_set()
             due = done.step % options.checkpoint_every == 0 or done.step == total
             if stop or due:

@@ -58,7 +58,7 @@ def _made(paths: Sequence[Path], out: Path):
     for name, table in {FILE: rows, "claims.csv": effect_table(found), "predictors.csv": related}.items():
         write_atomically(out / name, table.to_csv(index=False).encode())
         yield out / name
-    yield from make(rows, out, read_trajectory(along) if along.is_file() else None)
+    yield from make(rows, found, related, out, read_trajectory(along) if along.is_file() else None)
 
 
 def tell(rows: pd.DataFrame, found: Sequence[Judgement], console: Console) -> None:

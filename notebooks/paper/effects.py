@@ -121,21 +121,18 @@ def _means(values: pd.Series, keys: Sequence[str]) -> pd.Series:
     return values if values.index.is_unique else pd.Series(values.groupby(level=list(keys)).mean())
 
 
-def gains(rows: pd.DataFrame, method: str) -> pd.Series:
-    """PSNR minus that of 3DGS, dB, by scene and seed."""
-    return (numbers(rows, SCORE, method) - numbers(rows, SCORE, BASE)).dropna()
+def gains(rows: pd.DataFrame, method: str, over: str = BASE) -> pd.Series:
+    """PSNR minus that of another method, dB, by scene and seed."""
+    return (numbers(rows, SCORE, method) - numbers(rows, SCORE, over)).dropna()
 
 
 def gain(rows: pd.DataFrame, method: str, over: str = BASE) -> Interval:
-    """PSNR minus that of another method, dB, with the deviation of such differences that all methods have together."""
-    if over not in set(rows["method"]) or SCORE not in rows:
-        return Interval.of([])
-    table = rows.pivot_table(SCORE, list(PAIR), "method")
-    each = table.sub(table[over], axis=0).drop(columns=over)
-    freedom = int((each.count() - 1).clip(lower=0).sum())
-    deviation = float(np.sqrt(np.nansum((each - each.mean()) ** 2) / max(freedom, 1)))
-    values = pd.Series(each[method]) if method in each else []
-    return Interval.of(values, (deviation, freedom) if freedom else None)
+    """The mean of `gains`, with the deviation that those of all methods have together."""
+    others = [name for name in dict.fromkeys(rows["method"]) if name != over]
+    within = [found - found.mean() for name in others if len(found := gains(rows, name, over)) > 1]
+    freedom = sum(map(len, within)) - len(within)
+    deviation = float(np.sqrt(sum(found @ found for found in within) / max(freedom, 1)))
+    return Interval.of(gains(rows, method, over), (deviation, freedom) if freedom else None)
 
 
 def log_ratios(rows: pd.DataFrame, name: str, method: str = STABLE) -> pd.Series:

@@ -21,8 +21,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
 from notebooks.paper.effect_figures import GIVEN, SIGNIFICANT, draw_claims, draw_predictors, words_of
 from notebooks.paper.effects import BASE, LEAST, SCORE, STABLE, Interval, gain, log_ratios, numbers
-from notebooks.paper.predictors import predictors
-from notebooks.paper.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
+from notebooks.paper.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, Judgement, effect_table
 from splat.model.untrusted import replacing
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -50,11 +49,16 @@ AXES: tuple[tuple[str, str, float | None], ...] = (
 )
 
 
-def make(rows: pd.DataFrame, out: Path, along: pd.DataFrame | None = None) -> Iterator[Path]:
-    """Draw everything; gives each file when it is there.  along: records along some of the trainings."""
+def make(
+    rows: pd.DataFrame, found: Sequence[Judgement], related: pd.DataFrame, out: Path, along: pd.DataFrame | None = None
+) -> Iterator[Path]:
+    """Draw everything; gives each file when it is there.
+
+    found: the verdicts on the rows; related: what goes with the score; along: records along some of the trainings.
+    """
     drawn = {
-        "claims": draw_claims(effect_table(judgements(rows))),
-        "predictors": draw_predictors(predictors(rows)),
+        "claims": draw_claims(effect_table(found)),
+        "predictors": draw_predictors(related),
         "budget": draw_budget(rows),
         "axes": draw_axes(rows),
     }
@@ -64,21 +68,21 @@ def make(rows: pd.DataFrame, out: Path, along: pd.DataFrame | None = None) -> It
         for suffix in ("png", "pdf"):
             yield save(figure, out / f"{name}.{suffix}")
     with replacing(out / "captions.md") as partial:
-        partial.write_text(captions(rows, list(drawn)), encoding="utf-8")
+        partial.write_text(captions(rows, found, related, list(drawn)), encoding="utf-8")
     yield out / "captions.md"
 
 
-def captions(rows: pd.DataFrame, drawn: Sequence[str]) -> str:
+def captions(rows: pd.DataFrame, found: Sequence[Judgement], related: pd.DataFrame, drawn: Sequence[str]) -> str:
     """Captions of what was drawn, trainings and verdicts as Markdown, from the numbers."""
     words = {
         "claims": "Effects with their 95% intervals over seeds; diamond: the paper's size.",
-        "predictors": _of_predictors(predictors(rows)),
+        "predictors": _of_predictors(related),
         "budget": _of_budget(rows),
         "axes": _of_axes(rows),
         "index": "The eigenvalue ratio |λmax / λmin| over the steps; line: median, band: all seeds.",
     }
     lines = [f"**{name}.** {caption}" for name, caption in words.items() if name in drawn] + [_trainings(rows)]
-    lines += [f"{each.number}. {each.statement} **{each.verdict}.** {each.finding}" for each in judgements(rows)]
+    lines += [f"{each.number}. {each.statement} **{each.verdict}.** {each.finding}" for each in found]
     return "\n\n".join(lines) + "\n"
 
 

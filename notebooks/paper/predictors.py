@@ -43,8 +43,8 @@ LEAST = 5
 def predictors(rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each quantity and kind, with the columns COLUMNS; n: runs.
 
-    Left out: kinds with fewer than LEAST clusters, and quantities that most runs lack, as the others' correlations would be
-    over different runs.  A control is left out of its own condition.
+    Left out: methods with one seed of a scene, kinds with fewer than LEAST clusters, and quantities that most runs lack, as the
+    others' correlations would be over different runs.  A control is left out of its own condition.
     """
     table = pd.DataFrame(_lines(rows), columns=[name for name in COLUMNS if name != "holm"])
     table["holm"] = table.groupby("kind")["p"].transform(holm)
@@ -56,7 +56,7 @@ def _lines(rows: pd.DataFrame) -> Iterator[dict]:
         controls = [control for control in CONTROLS if control in rows and control != name]
         if name not in rows or 2 * len(pd.Series(rows[name]).dropna()) < len(rows):
             continue
-        # machines repeat a training, and a method with one seed has no share in `within`
+        # machines repeat a training; all kinds are of the same runs
         keys, columns = ["scene", "method", "seed"], [*dict.fromkeys([name, SCORE, *controls])]
         once = pd.DataFrame(rows[keys + columns].dropna().groupby(keys, sort=False).mean())
         known = once.reset_index().groupby(keys[:2], sort=False).filter(lambda runs: len(runs) > 1)

@@ -241,8 +241,7 @@ def _use_study(root: Path, chance: Random) -> Read:
     with io.StringIO() as quiet:
         tell(rows, found, Console(file=quiet))
     if chance.random() < DRAWN:
-        predictors(rows)
-        captions(rows, ["predictors", "budget", "axes"])
+        captions(rows, found, predictors(rows), ["predictors", "budget", "axes"])
     return None
 
 

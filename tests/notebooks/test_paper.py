@@ -9,12 +9,16 @@ from figures import uses
 from landscape.errors import InputError
 from notebooks.paper.__main__ import main
 from notebooks.paper.figures import AXES, captions, draw_axes, draw_budget, draw_index, method_words
+from notebooks.paper.predictors import predictors
+from notebooks.paper.statements import judgements
 from tests.figures.test_figures import laid_out
 from tests.notebooks.test_claims import NAMES, OTHERWISE, PAPER, made_up
 
 
 def test_captions_change_with_the_numbers():
-    ours, other = captions(made_up(PAPER), NAMES), captions(made_up(OTHERWISE), NAMES)
+    ours, other = (
+        captions(rows, judgements(rows), predictors(rows), NAMES) for rows in (made_up(PAPER), made_up(OTHERWISE))
+    )
     assert ours.count("**holds.**") == 10 and other.count("**does not hold.**") == 10
     assert "**index.**" not in ours  # not drawn
     missing = (

@@ -9,7 +9,7 @@ are steep.
 import re
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from time import perf_counter
@@ -41,7 +41,8 @@ from landscape.slices.slices import curvature_reach
 from landscape.traces.pixels import gauss_newton_blocks
 
 NAMED = re.compile(r"(.+\.py):([^\W\d]\w*)")
-UNUSED = ("device", "loss", "seconds", "power", "per_attribute", "split_control", "metric", "memory", "foreign")
+USED = {"checkpoint", "out", "seed", "strict", "verbose", "quick", "density_products", "end_products"}
+USED |= {"slice_points", "slice_rise"}
 POSITIONS, HALVINGS = "means", 7  # of the step along an end that changes the loss by RISE
 
 
@@ -51,7 +52,7 @@ def run_any_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Dra
         return run_probe(options, command, drawn)
     require_seed(options.seed)
     default = ProbeOptions(options.checkpoint)
-    for name in UNUSED:
+    for name in (field.name for field in fields(options) if field.name not in USED):
         if getattr(options, name) != getattr(default, name):
             raise InputError(f"expected of a renderer no --{name.replace('_', '-')}, got one; leave it out")
     start, path, name = perf_counter(), Path(found[1]), found[2]
