@@ -193,7 +193,7 @@ def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
 
 
 def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
-    """An end of the spectrum: the view with the carriers, and its part at -step, 0 and +step."""
+    """An end of the spectrum: the view with the carriers, and its part at -step, 0 and +step (units of the parameters)."""
     left, top, right, bottom = end.crop
     changes, share = (
         [loss / end.losses[1] - 1 for loss in end.losses],
@@ -208,8 +208,8 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
         parts = {
             "photograph": (0, 1, f"Gaussians with {share} of {end.name}"),
             "zero": (0, 2, f"Render: loss {quantity(end.losses[1])}"),
-            "minus": (1, 0, f"{step} units of the parameters back: loss {back}"),
-            "plus": (1, 1, f"{step} units of the parameters forth: loss {forth}"),
+            "minus": (1, 0, f"A step of {step} back: loss {back}"),
+            "plus": (1, 1, f"A step of {step} forth: loss {forth}"),
         }
         ways = {name: sheet.show(row, column, maps[name], title) for name, (row, column, title) in parts.items()} | {
             "view": whole

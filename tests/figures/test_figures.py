@@ -1,3 +1,4 @@
+import json
 import math
 import os
 import signal
@@ -11,16 +12,18 @@ import pytest
 from matplotlib.axes._secondary_axes import SecondaryAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
+from msgspec import convert
 from PIL import Image
 
 from analysis.console.drawing import own_python
 from analysis.records.quantities import exponent_of
-from figures import make_all, slice2d, spectrum, surface, traces
+from analysis.records.run_files import END_MAPS, Steepest
+from figures import make_all, maps, slice2d, spectrum, surface, traces
 from figures.plane import plane
 from figures.render_surface import Box
 from figures.style import BLACK, COLUMN, save, style
 from landscape.errors import TooLittleMemory
-from tests.recorded import long_numbers, synthetic, written
+from tests.recorded import long_numbers, synthetic, written, written_map
 from tests.refusals import refused
 
 POINT = 1 / 72  # inches
@@ -71,7 +74,10 @@ def require_layout(figure):
     assert figure.get_figwidth() == COLUMN
     assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
     assert drawn.x1 <= COLUMN + POINT and drawn.y1 <= figure.get_figheight() + POINT
-    boxes = words(figure, renderer)
+    require_apart(words(figure, renderer))
+
+
+def require_apart(boxes):
     pairs = [(a, b) for i, (a, box) in enumerate(boxes) for b, near in boxes[:i] if box.shrunk(0.9, 0.9).overlaps(near)]
     assert pairs == []
 
@@ -117,6 +123,17 @@ def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, m
         warnings.simplefilter("ignore", surface.RendererMissing)
         figure = module.draw(written(tmp_path / "probe", *difficult(case)))
     require_layout(figure)
+
+
+def test_titles_of_renders_along_an_end_stay_apart(tmp_path):
+    written_map(tmp_path / "map", {})
+    end = json.loads((tmp_path / "map" / "map.json").read_text())["steepest"][0]
+    end |= {"step": 0.00373, "losses": [0.07408, 0.0735, 0.07414]}
+    pictures = {name: np.zeros((126, 168, 3), np.uint8) for name in END_MAPS} | {
+        "difference": np.zeros((126, 168), np.uint8)
+    }
+    figure = maps.draw_steepest(pictures, convert(end, Steepest))
+    require_apart(words(figure, laid_out(figure)))
 
 
 def test_the_drawn_traces_are_the_recorded_ones(tmp_path):
