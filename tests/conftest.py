@@ -20,6 +20,13 @@ for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHU
         signal.signal(number, usual)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that run on a GPU where there is one."""
+    for item in items:
+        if "device" in getattr(item, "fixturenames", ()):
+            item.add_marker("cuda")
+
+
 def _real_scene(name: str) -> Path:
     """A folder of the real data: $LANDSCAPE_DATA, else shared/data beside the repository."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"

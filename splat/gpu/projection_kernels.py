@@ -299,7 +299,8 @@ def linearize_geometry(
     e, lane = places(BLOCK, 16)
     here = e < m
     i = tl.load(index + e, here, other=0)
-    camera, (mean, log_scales, quat) = numbers(lens, LENS), geometry_at(flat, i, n, here)
+    camera = numbers(lens, LENS)
+    mean, log_scales, quat = geometry_at(flat, i, n, here)  # Triton 3.6 reads no nested names on the left
     splat, adjoint = row(splats, i, 9, 6, here), row(moments, i, 9, 6, here)
     S = tl.load(moments + i * 9, here, other=0.0).to(tl.float64)
     logit, width = tl.load(flat + start_of(3, n) + i, here, other=0.0).to(tl.float64), row(widths, i, 1, 1, here)[0]
