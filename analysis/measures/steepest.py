@@ -135,7 +135,8 @@ def kink_curvature(objective: SceneObjective, vector: Float[Tensor, " p"]) -> fl
     loss, total = objective.loss_settings, 0.0
     if loss.pixel == "l1":
         for view, linearized in zip(objective.views, objective.linearized, strict=True):
-            change, residual = linearized.jvp(vector[:, None])[0, :3].double(), linearized.image - view.image
+            change = linearized.jvp(vector[:, None])[0, :3].double()
+            residual = linearized.image - view.image.to(linearized.image)
             near = residual.abs() < NEAR
             total += loss.pixel_weight * float(change[near].square().sum()) / NEAR / residual.numel()
     return total / len(objective.views)

@@ -17,7 +17,7 @@ NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 def relative_error(got: Tensor | np.ndarray, expected: Tensor | np.ndarray) -> float:
     """|got - expected| / |expected| in the 2-norm; infinite where got is not finite or of another shape."""
-    got, expected = torch.as_tensor(got).detach().double(), torch.as_tensor(expected).detach().double()
+    got, expected = (torch.as_tensor(each).detach().cpu().double() for each in (got, expected))
     if got.shape != expected.shape or not torch.isfinite(got).all():
         return float("inf")
     difference, size = float((got - expected).norm()), float(expected.norm())
