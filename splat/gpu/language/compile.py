@@ -10,6 +10,9 @@ import triton
 from splat.gpu.language.formula import Formula
 
 
+OF_IMAGES = ("width", "height", "columns", "v_stride", "out_stride")  # sizes: a scene's next photograph may have others
+
+
 class Kernel(triton.JITFunction):
     """A kernel, or a function that kernels call, for which no stale code is taken from Triton's cache.
 
@@ -25,16 +28,16 @@ class Kernel(triton.JITFunction):
 
 def jit(function: Callable) -> Any:
     """Decorate a kernel, or a function that kernels call."""
-    return Kernel(function)
+    return Kernel(function, do_not_specialize=OF_IMAGES)
 
 
 def sized(*names: str) -> Any:
     """Decorate a kernel, naming the parameters that change between launches: counts of Gaussians, vectors or intersections.
 
     Triton compiles a kernel anew, which takes seconds, where an integer that is not named becomes 1 or a multiple of 16 or
-    ceases to be.
+    ceases to be.  Those in OF_IMAGES need not be named.
     """
-    return partial(Kernel, do_not_specialize=names)
+    return partial(Kernel, do_not_specialize=(*OF_IMAGES, *names))
 
 
 def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
