@@ -86,7 +86,7 @@ def beyond(length: int) -> Float64[Tensor, " length"]:
 
 def blur(fields: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
     """The window's weighted mean round every pixel; zero outside the image.  Its own adjoint."""
-    weight, channels = window(fields.dtype), fields.shape[0]
+    weight, channels = window(fields.dtype).to(fields.device), fields.shape[0]
     rows = F.conv2d(
         fields[None], weight.view(1, 1, 1, -1).expand(channels, 1, 1, -1), padding=(0, REACH), groups=channels
     )

@@ -1,14 +1,12 @@
 """Decorators for Triton's kernels and for the functions that they call, and the launch of a kernel."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
 import triton
 
 from splat.gpu.language.formula import Formula
-
 
 OF_IMAGES = ("width", "height", "columns", "v_stride", "out_stride")  # sizes: a scene's next photograph may have others
 
@@ -28,7 +26,7 @@ class Kernel(triton.JITFunction):
 
 def jit(function: Callable) -> Any:
     """Decorate a kernel, or a function that kernels call."""
-    return Kernel(function, do_not_specialize=OF_IMAGES)
+    return sized()(function)
 
 
 def sized(*names: str) -> Any:
@@ -37,7 +35,12 @@ def sized(*names: str) -> Any:
     Triton compiles a kernel anew, which takes seconds, where an integer that is not named becomes 1 or a multiple of 16 or
     ceases to be.  Those in OF_IMAGES need not be named.
     """
-    return partial(Kernel, do_not_specialize=(*OF_IMAGES, *names))
+
+    def decorated(function: Callable) -> Kernel:
+        numbers = [name for name in (*OF_IMAGES, *names) if name not in function.__annotations__]
+        return Kernel(function, do_not_specialize=numbers)
+
+    return decorated
 
 
 def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants: Any) -> None:

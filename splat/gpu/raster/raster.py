@@ -224,7 +224,7 @@ class CudaTangent:
         moved = (self._directions != 0).any(dim=2).to(torch.int8)
         self.planes: Float[Tensor, "k 4 h w"] = raster._empty(K, 4, raster.height, raster.width)
         self._transmittances = raster._empty(K, raster.height, raster.width)
-        self._moves = raster._empty(len(_parts(K)), len(raster._reached), dtype=torch.int32)
+        self._moves = [raster._empty(len(raster._reached), dtype=torch.int32) for _ in _parts(K)]
         for part, moves in zip(_parts(K), self._moves, strict=True):
             raster._launch(
                 compositing.tangent, raster.lists.start, raster._reached, raster.lists.splat, raster.params, raster.frame,

@@ -1,4 +1,4 @@
-"""The bench of scenes on the kernels for GPUs, at toy size: without one by `tests.ptx`, with a clock that is given."""
+"""The bench of scenes on the kernels for GPUs, at toy size: without one by Triton's interpreter, with a clock that is given."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ from analysis.bench.scene import ViewBench
 from analysis.bench.timing import Meter, Timing
 from analysis.bench.workloads import Workload
 from splat.losses.reference import LossSettings
-from tests.splat.gpu.emulated import emulate
+from tests.splat.gpu.interpreted import emulate
 from tests.splat.held_scenes import two_views
 from tests.splat.random_scenes import random_gaussians
 from tests.splat.tolerances import relative_error

@@ -11,6 +11,7 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 from analysis.measures.depth import depth_rises, depth_split
 from analysis.measures.localization import conditions, localize
 from analysis.measures.split_control import split_control
+from analysis.measures.steepest import kink_curvature
 from analysis.measures.units import scene_units
 from landscape.eigen.lanczos import lanczos
 from landscape.operators.operator import DenseOperator
@@ -23,8 +24,8 @@ from splat.training.loop import train
 from splat.training.methods.corgs import _pruned, confirmed
 from splat.training.methods.depth.fsgs import FSGS, unpool
 from splat.training.state import Training
-from tests.splat.gpu.emulated import emulate
 from tests.splat.gpu.fake_device import FakeDevice
+from tests.splat.gpu.interpreted import emulate
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import random_gaussians, random_like
 from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
@@ -113,6 +114,7 @@ def test_products_of_a_scene_stay_on_the_device_and_do_not_wait(monkeypatch):
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
         split_control(objective.active, [views[0].camera])
         depth_split(objective, torch.Generator().manual_seed(0), TraceSettings.fixed(8))
+        kink_curvature(objective, V[:, 0])
         depth_rises(objective, torch.Generator().manual_seed(0), steps=(1.0,), draws=2)
     assert not +fake.mixed
 

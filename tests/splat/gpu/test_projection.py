@@ -1,4 +1,4 @@
-"""Projection on the GPU (without one, by `tests.ptx`), against the specification and the CPU's tests' own truth."""
+"""Projection on the GPU (without one, by Triton's interpreter), against the specification and the CPU's tests' own truth."""
 
 import numpy as np
 import pytest

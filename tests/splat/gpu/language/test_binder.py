@@ -1,4 +1,4 @@
-"""No launch of the GPU's path has a kernel compiled anew for another number of Gaussians or vectors.
+"""No launch of the GPU's path has a kernel compiled anew for another number of Gaussians or vectors, or size of images.
 
 A driver that is none and a compiler that compiles nothing stand in: what Triton makes of the arguments is what is looked at.
 """
@@ -10,11 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tests.ptx.driver import stand_in
-from tests.splat.gpu.ahead_of_time import run_as_script
+from tests.splat.gpu.ahead_of_time import run_as_script, stand_in
 
 
-def test_no_number_of_gaussians_or_vectors_compiles_a_kernel_anew() -> None:
+def test_no_number_of_gaussians_or_vectors_and_no_size_compiles_a_kernel_anew() -> None:
     lines = [line.split() for line in run_as_script(__file__)]
     assert len(lines) == 31
     for name, few, more in lines:
@@ -46,8 +45,8 @@ def one_each(kernel: Any, arguments: tuple) -> None:
         dict(zip(kernel.arg_names, arguments, strict=True))["count"].fill_(1)
 
 
-def launch_all(n: int, m: int, K: int) -> None:
-    """All kernels, for n Gaussians of which m are in sight, and K vectors."""
+def launch_all(n: int, m: int, K: int, size: tuple[int, int] = (30, 22)) -> None:
+    """All kernels, for n Gaussians of which m are in sight, and K vectors; size: of the image."""
     from splat.curvature.linearize import LinearizedView
     from splat.gpu.adam import adam_step
     from splat.gpu.loss import CudaImageLoss
@@ -60,7 +59,7 @@ def launch_all(n: int, m: int, K: int) -> None:
     from tests.splat.random_scenes import random_gaussians
 
     CudaRaster.touched = property(lambda _raster: torch.arange(m))  # pyright: ignore[reportAttributeAccessIssue]
-    gaussians, view = random_gaussians(n, 1).to(torch.float32), two_views()[0]
+    gaussians, view = random_gaussians(n, 1).to(torch.float32), two_views(*size)[0]
     flat, settings = gaussians.flat, LossSettings("charbonnier", 0.2)
     loss = backend_of(flat).view_loss(view.image, settings, flat)
     ordered, atomic = RenderSettings(accumulation="deterministic"), RenderSettings(accumulation="atomic")
@@ -103,5 +102,6 @@ if __name__ == "__main__":
     few = compiled.copy()
     for numbers in ((48, 33, 10), (37, 16, 10), (37, 33, 16)):
         launch_all(*numbers)
+    launch_all(37, 33, 10, (32, 16))
     for name in kernels():
         print(name, few[name], compiled[name])

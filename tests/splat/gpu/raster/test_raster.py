@@ -1,4 +1,4 @@
-"""The compositing kernels for GPUs against the float64 specification; on a machine without one, by `tests.ptx`."""
+"""The compositing kernels for GPUs against the float64 specification; on a machine without one, by Triton's interpreter."""
 
 import os
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from splat.projection.reference import Splats
 from splat.render import autograd as functions
 from splat.render.backend import plain_gradient
 from splat.render.formulas import SPLAT
-from tests.splat.gpu.emulated import emulate
+from tests.splat.gpu.interpreted import emulate
 from tests.splat.render.compositing_cases import BACKGROUND, BLOCKS, CASES, TINY, plain_jvp, plain_product, truth
 from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, relative_error
 
