@@ -184,7 +184,7 @@ def synthetic_line(scale: float = 1.0) -> tuple[dict[str, Any], dict[str, dict[s
     evaluated = np.arange(21) % 2 == 0
     steps = np.array([1e-6, 1e-5, 1e-4, 1e-3])
     direction = {"name": "gradient", "kind": "gradient", "slope": 2e-3 * scale, "curvature": curvature}
-    direction |= {"residual": None, "unit": 2e-3, "length": 1.0, "scale": "stored units"}
+    direction |= {"residual": None, "unit": 2e-3, "length": 1.0, "scale": "units of the parameters"}
     line = {"directions": [direction], "loss_scale": 8e-5 * scale, "cosine": None, "center_loss": center, "points": 21}
     line |= {"evaluated_points": 11, "crossed_points": 6, "evaluations": 12, "interpolation_error": 0.004}
     probe = {"steps": steps.tolist(), "curvatures": [c * scale for c in (-3e4, 41.0, 55.0, 70.0)], "best": 1}

@@ -1,6 +1,6 @@
 """Metrics of the parameter space: in which units curvature is compared, as D of D H D (`landscape.ScaledOperator`).
 
-parameters   D = 1: curvature per squared stored unit
+parameters   D = 1: curvature per squared unit of the parameters
 scene        positions in units of the scene's size, the rest as it is: what two scenes may be compared in
 optimiser    D the learning rate of every parameter at the first step: curvature per step of the training
 

@@ -235,7 +235,7 @@ def slice_record(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
         ],
         loss_scale=plane.loss_scale,
         **plane.slice.record(),  # pyright: ignore[reportArgumentType]
-        note=f"±{quantity(units[0])} curvature units each way: ±{x} along e₁ and ±{y} along e₂, stored units",
+        note=f"±{quantity(units[0])} curvature units each way: ±{x} along e₁ and ±{y} along e₂, units of the parameters",
     )
 
 

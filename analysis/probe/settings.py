@@ -24,7 +24,7 @@ class ProbeSettings:
     slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
         of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
         slice_plane: whether to render more than its two axes.
-    probe_steps: of the finite probe, in stored units; (): it is left out.  noise_points: renders from which it tells the
+    probe_steps: of the finite probe, units of the parameters; (): left out.  noise_points: renders from which it tells the
         noise of a render.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
     block_samples: of the share of H within the Gaussians' blocks; block_ssim_window: with SSIM's window, too.

@@ -149,7 +149,7 @@ def _of_largest_trace(traces: Mapping[str, schema.Trace], values: Mapping[str, f
     text = (
         f"{attribute_name(first).capitalize()} carries {part} of the curvature: its trace, "
         f"{measured(values[first], traces[first].standard_error)}, is {share:.0%} of the sum of all absolute traces (each in "
-        "its own stored units)."
+        "its own units)."
     )
     if near := [attribute_name(name) for name in others if not traces[first].exceeds(traces[name])]:
         text += f" Its error does not separate it from {' and '.join(near)}."

@@ -1,7 +1,7 @@
 """The sections of a record as typed structures (`msgspec`): meaning and type of every key.
 
 The whole files `probe.json` and `slice.json` are `ProbeRecord` and `SliceRecord` in `analysis.records.records`.  Losses are
-dimensionless; curvatures are loss per squared stored unit, with respect to the stored parameters.
+dimensionless; curvatures are loss per squared unit of the parameters, with respect to the stored parameters.
 
 null (None)   not determined; the `note` beside it says why
 UNSET         the key is absent: not every file has it.  UNSET is false, as None is
@@ -170,7 +170,7 @@ class End(Struct, kw_only=True):
 class Renders(Struct, kw_only=True):
     """Rendered losses along an eigenvector v beside its eigenvalue (`landscape.slices.finite_probe`).
 
-    steps: along v, stored units, each twice the one before; ratios: to the quadratic model, of the second difference to the
+    steps: along v, each twice the one before; ratios: to the quadratic model, of the second difference to the
     eigenvalue; errors: of these, four standard errors of round-off.  confirmed: null where round-off decides; low, high: of
     the steps that confirm.  optimiser_step: the root mean square length along v of a step with random signs, as long as the
     optimiser's first in every parameter: one of the steps; 0 where not known.  kinks: the curvature
@@ -423,7 +423,7 @@ class Direction(Struct, kw_only=True):
 
     kind: "eigenvectors", "random", "gradient" or "line".  slope, curvature: of the loss along it.  residual: of an
     eigenvector, else None.  unit: sqrt(2 loss_scale / |curvature|), the step within which the curvature alone changes the loss
-    by loss_scale; infinite without curvature.  length: of the vector, in stored units.  scale: what a step of 1 is.
+    by loss_scale; infinite without curvature.  length: of the vector, in units of the parameters.  scale: what a step of 1 is.
     views_error: of the curvature, as for `TraceOf`.
     """
 

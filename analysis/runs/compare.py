@@ -43,7 +43,7 @@ PICTURES = {
     "compare_densities": "How many directions are at least so curved, down (left) and up (right). Thin: each start "
     "vector's quadrature alone: where these lie apart, its few steps do not decide. Dashed: the ends found.",
     "compare_slices": "The plane of the two steepest directions of each run, in the window that all have, the same colours.",
-    "compare_sections": "The loss along the two steepest directions of each run, in stored units.",
+    "compare_sections": "The loss along the two steepest directions of each run, in units of the parameters.",
 }
 
 

@@ -40,7 +40,7 @@ PER_UNIT = {
 }  # fmt: skip
 WORDS = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "colour"}
 PREFIXES = ("", "gn_")
-MIXED = "per stored unit²"
+MIXED = "per unit² of the parameters"
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Field:
 OF_BLOCKS = {
     **{f"trace_{name}": Field(f"trace of {WORDS[name]}", unit, "signed") for name, unit in PER_UNIT.items()},
     "largest": Field("largest curvature", MIXED, "log"),
-    "log_det": Field("log-determinant", "ln of stored units", "linear"),
+    "log_det": Field("log-determinant", "ln of units of the parameters", "linear"),
     "rank": Field("rank of the block", "of 10", "linear"),
     "negative": Field("negative curvatures of the block", "of 10", "linear"),
     "depth": Field("curvature along the ray", PER_UNIT["means"], "signed"),

@@ -82,7 +82,7 @@ def test_the_controls_colour_hide_and_step(viewer, objective):
     viewer.recolour()
     kind, (low, high) = fields.kinds["largest"], np.percentile(values, (90, 100))
     between = f"from {view.quantity(low)} to {view.in_words(kind, high)}"
-    assert between in viewer.between.content and "per stored unit²" in between
+    assert between in viewer.between.content and "per unit² of the parameters" in between
     shade = fields.shade("largest")  # whose ends are the slider's at first
     colours = f"from {view.quantity(shade.value(shade.low))} to {view.in_words(kind, shade.value(shade.high))}"
     assert colours in viewer.ends.content
@@ -137,7 +137,7 @@ def test_a_pick_is_outlined_and_lists_the_field_shown_first(viewer, objective):
     viewer.click(*_ray(viewer, objective))
     index, _ = viewer.picked
     told = viewer.numbers.content.splitlines()
-    assert told[2].startswith("**largest curvature: ") and told[2].endswith("per stored unit²**")
+    assert told[2].startswith("**largest curvature: ") and told[2].endswith("per unit² of the parameters**")
     assert f"- views that see it: {int(viewer.fields.values['views'][index])}" in told
     viewer.field.value = "views that see it"
     viewer.recolour()

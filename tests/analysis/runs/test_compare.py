@@ -44,7 +44,13 @@ def record(folder: Path, scale: float, **changes) -> None:
     data["split_control"] = {"gaussians": 20182, "rms": 0.01 * scale, "largest": 0.1, "psnr": 40.0 / scale}
     data["split_control"]["effects"] = effects
     end = {"value": 4.0, "residual": 0.1, "reason": "tolerance"}
-    about = {"operator": "hessian", "block": "means", "metric": "parameters", "unit": "stored units", "split": False}
+    about = {
+        "operator": "hessian",
+        "block": "means",
+        "metric": "parameters",
+        "unit": "units of the parameters",
+        "split": False,
+    }
     index = {"value": 7.0 * scale, "low": 6.0 * scale, "high": 9.0 * scale, "note": ""}
     names = ("eigenvalue_ratio", "negative_ratio", "top_mass", "participation_ratio")
     family = {"gaussians": 10091, "dim": 30273, "rank": 30000, "lambda_max": end, "lambda_min": end}
