@@ -10,6 +10,7 @@ import fcntl
 import glob
 import json
 import os
+import pickletools
 import re
 import shutil
 import tomllib
@@ -19,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from io import BufferedReader, BytesIO, FileIO, StringIO
+from itertools import chain
 from math import prod
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
@@ -38,6 +40,11 @@ EXPANSION = 32  # times its size on disk that an archive may hold; what this pro
 LFS_MAGIC = b"version https://git-lfs"
 SLACK = 2**20  # bytes that any archive may hold
 FOLDER = 0x10  # among the attributes of a member
+PLAIN = re.compile(  # names in a pickle that make nothing larger than what the file holds
+    r"torch (?!\w*Tensor$)\w+|torch\._utils _rebuild_(?!qtensor)\w+|torch\.nn\.parameter Parameter|numpy dtype|"
+    r"torch\.serialization _get_layout|torch\._tensor _rebuild_from_type_v2|numpy\._?core\.multiarray scalar|"
+    r"collections (OrderedDict|Counter)|(builtins|__builtin__) (set|complex)|_codecs encode"
+)
 MOST_TEXT = 2**28  # bytes of a file of text
 DEEPEST = 64  # levels of lists and mappings in one; records have at most ten, and Python takes about 300
 MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
@@ -49,11 +56,15 @@ TAKEN = "expected {what}, got another at work, which holds {path}; wait until it
 
 
 def require_modest(archive: zipfile.ZipFile) -> None:
-    """InputError where the members of an archive, which may share their bytes, are far larger than the file."""
+    """InputError where the members of an archive, which may share their bytes, are far larger than the file.
+
+    Python asks for the memory of as many bytes as a member is said to have in the file before it reads one.
+    """
     assert archive.fp is not None
-    size, held = archive.fp.seek(0, os.SEEK_END), sum(member.file_size for member in archive.infolist())
-    if held > EXPANSION * size + SLACK:
-        raise InputError(f"it promises {held:,} bytes in a file of {size:,}")
+    size, members = archive.fp.seek(0, os.SEEK_END), archive.infolist()
+    held, packed = sum(member.file_size for member in members), sum(member.compress_size for member in members)
+    if held > EXPANSION * size + SLACK or packed > size:
+        raise InputError(f"it promises {max(held, packed):,} bytes in a file of {size:,}")
 
 
 def require_whole(archive: zipfile.ZipFile) -> None:
@@ -68,6 +79,37 @@ def require_whole(archive: zipfile.ZipFile) -> None:
             raise InputError(f"{member.filename!r} is marked as a folder, or promises other bytes than it has")
     if wrong := archive.testzip():
         raise InputError(f"the checksum of {wrong!r} is wrong")
+    for member in archive.infolist():
+        if member.filename.lower().endswith("data.pkl"):  # torch finds it in capitals too
+            _require_plain(archive.read(member))
+
+
+def _require_plain(content: bytes) -> None:
+    """InputError where a pickle that torch is to read has names other than PLAIN.
+
+    torch lets more through, such as `bytearray` and `torch.Tensor`, which take as much memory as a number in the file says.
+    So do NumPy's types of any length, and `encode`, which in some codecs doubles its bytes: both must be as `torch.save`
+    writes them.
+    """
+    memo: dict[Any, tuple[str, Any]] = {}
+    words: list[tuple[str, Any]] = [("", None)] * 4  # the last operations, and what they name
+    for operation, value, _ in chain(pickletools.genops(content), [(pickletools.code2op["."], None, None)] * 3):
+        if "PUT" in operation.name:
+            memo[value] = words[-1]
+            continue
+        words = [*words[1:], memo[value] if "GET" in operation.name else (operation.name, value)]
+        (kind, name), first, *more = words
+        if kind != "GLOBAL":
+            continue
+        known = PLAIN.fullmatch(name) is not None
+        if name == "numpy dtype":
+            known = re.fullmatch("[bfi][1248]", str(first[1])) is not None
+        elif name == "_codecs encode":
+            known = more == [("BINUNICODE", "latin1"), ("TUPLE2", None)]
+        if not known:
+            raise InputError(
+                f"it holds more than tensors and numbers: a {name.replace(' ', '.')}; save it again without that"
+            )
 
 
 def require_held(file: BinaryIO, size: int) -> np.dtype:

@@ -35,7 +35,6 @@ OWN = b"splat-landscape checkpoint"
 WRAPPED = r"(?:(?:module|_orig_mod)\.)*"
 NERFSTUDIO = re.compile(rf"({WRAPPED}_model\.{WRAPPED}(?:gauss_params\.)?)means")
 MOVED = re.compile(r"camera_opt|bil_grid|appearance|exposure")  # in names of further parameters that splatfacto fits
-FORBIDDEN = re.compile(r"GLOBAL ([\w.]+)|class(?:es)? ([\w.]+)")  # in torch's words on a pickle with other objects
 NUMPY_TYPES = ("Float64DType", "Float32DType", "Int64DType", "Int32DType", "BoolDType")
 
 
@@ -83,16 +82,14 @@ def load_tensors(content: bytes) -> Any:
 
 
 def torch_reason(error: Exception) -> str:
-    """Why torch did not load a file: the kind of object in it that is not allowed, else its words, without its advice.
+    """Why torch did not load a file, in its words, without its advice.
 
-    >>> torch_reason(RuntimeError("Weights only load failed. ... Unsupported global: GLOBAL pathlib.PosixPath was not ..."))
-    'a pathlib.PosixPath; save it again without that'
+    >>> torch_reason(RuntimeError("record is short. Do this"))
+    'record is short'
     """
     words = "".join(letter if letter.isprintable() else " " for letter in str(error))
-    if "weights" in words.lower() and (found := FORBIDDEN.search(words)):
-        return f"a {found[1] or found[2]}; save it again without that"
     sentence = re.split(r"\. |  ", words.strip() or type(error).__name__)[0]
-    return "objects of Python that could run code" if "weights_only" in sentence.lower() else sentence[:200]
+    return "objects of Python that could run code" if "weights" in sentence.lower() else sentence[:200]
 
 
 def _numpy_scalars() -> list[Any]:

@@ -1,7 +1,9 @@
 """The same Gaussians come out of every tool's file, to the last bit of a float32; what cannot be rendered is refused."""
 
+import codecs
 import io
 import zipfile
+from collections.abc import Callable
 from copy import copy
 from datetime import datetime
 from fractions import Fraction
@@ -15,6 +17,7 @@ import torch
 from splat.model.files.read import is_foreign, read_cfg_args, read_splats
 from splat.model.files.splat_ply import splat_ply
 from splat.model.files.tensor_files import gsplat_bytes, load_tensors
+from splat.model.untrusted import read_arrays
 from splat.projection.antialias import baked
 from tests.refusals import refused
 from tests.splat.model.files import written
@@ -184,10 +187,29 @@ def test_colours_whose_white_is_not_known_are_refused(tmp_path, kind, name, whit
     refused("not known which one is white", read_splats, stored(tmp_path, "a.ply", coloured(kind, name, white)))
 
 
-THINGS = [(Path("/a"), "pathlib.PosixPath"), (datetime(2020, 1, 1), "datetime.datetime")]
+class Made:
+    """What a file makes by a call."""
+
+    def __init__(self, call: Callable[..., object], *arguments: object) -> None:
+        self.made = call, arguments
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
+        return self.made
 
 
-@pytest.mark.parametrize(("thing", "named"), [*THINGS, (Fraction(1, 2), "fractions.Fraction")])
+THINGS = [
+    (Path("/a"), "pathlib.PosixPath"),
+    (datetime(2020, 1, 1), "datetime.datetime"),
+    (Fraction(1, 2), "fractions.Fraction"),
+    (Made(bytearray, 10**12), r"\w+.bytearray"),  # and as many bytes
+    (Made(torch.Tensor, 10**12), "torch.Tensor"),
+    (Made(torch.UntypedStorage, 10**12), "torch.storage.UntypedStorage"),
+    (Made(np.dtype, "V2000000000"), "numpy.dtype"),
+    (Made(codecs.encode, Made(codecs.encode, "text", "latin1"), "hex"), "_codecs.encode"),
+]
+
+
+@pytest.mark.parametrize(("thing", "named"), THINGS)
 def test_objects_beside_the_tensors_are_named_without_torchs_advice(tmp_path, thing, named):
     path = stored(tmp_path, "ckpt_1_rank0.pt", written.saved({"step": 1, "splats": {}, "more": thing}))
     refused(f"more than tensors and numbers: a {named}; save it again without that$", read_splats, path)
@@ -267,27 +289,23 @@ def test_what_cannot_be_rendered_is_refused_in_a_sentence(tmp_path, content, mes
     assert str(tmp_path) in refused(message, read_splats, stored(tmp_path, "file", content))
 
 
-def test_members_that_share_their_bytes_are_no_more_than_the_file_may_hold(tmp_path):
+@pytest.mark.parametrize(("copies", "packed", "promised"), [(100, 0, "101,000,000"), (0, 2**32 - 2, "4,294,967,294")])
+def test_members_are_no_more_than_the_file_may_hold(tmp_path, copies, packed, promised):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr("a/data.pkl", bytes(10**6))
-        for i in range(100):
+        for i in range(copies):  # which share their bytes
             archive.filelist.append(copy(archive.filelist[0]))
             archive.filelist[-1].filename = f"a/data/{i}"
-    refused(r"promises 101,000,000 bytes", load_tensors, buffer.getvalue())
-    assert not is_foreign(stored(tmp_path, "bomb.pt", buffer.getvalue()))
-
-
-class Trap:
-    def __init__(self, touched: Path):
-        self.touched = touched
-
-    def __reduce__(self):
-        return (Path.touch, (self.touched,))
+        archive.filelist[0].compress_size = packed or 10**6
+    refused(f"promises {promised} bytes", load_tensors, buffer.getvalue())
+    path = stored(tmp_path, "bomb.pt", buffer.getvalue())
+    refused(f"promises {promised} bytes", read_arrays, path)
+    assert not is_foreign(path)
 
 
 def test_a_file_that_would_run_code_is_refused(tmp_path):
     touched = tmp_path / "ran-code"
-    path = stored(tmp_path, "ckpt.pt", written.saved({"step": 1, "splats": Trap(touched)}))
+    path = stored(tmp_path, "ckpt.pt", written.saved({"step": 1, "splats": Made(Path.touch, touched)}))
     refused("more than tensors", read_splats, path)
     assert not touched.exists()
