@@ -196,8 +196,7 @@ def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
 
 def _of_anisotropy(data: ProbeRecord) -> list[Line]:
     """The ratio of both ends, unless renders refute one, and the part of the steepest direction."""
-    lines, family = [], data.anisotropy
-    share, ratio = family.top_mass, family.negative_ratio if data.eigenvalues.stand else None
+    lines, share, ratio = [], data.indices.get("top_mass"), data.indices.get("negative_ratio")
     text = "The steepest direction down is {} times as curved as the steepest up{}."
     if ratio and _is_finite(ratio.value) and not is_loose(ratio) and ratio.value:
         lines.append(Line(text.format(quantity(ratio.value), _bracket(ratio))))
@@ -256,7 +255,7 @@ def _with(command: str, option: str, value: int) -> str:
 def _of_open(data: ProbeRecord) -> list[Line]:
     """The indices without a finite or useful bracket: the bracket, and the command that resolves it."""
     lines = []
-    for name, index in data.anisotropy.items():
+    for name, index in data.indices.items():
         if is_loose(index):
             text = f"{name.replace('_', ' ').capitalize()}: {UNDETERMINED}{_bracket(index)}; {remedy(data, name)}."
             lines.append(Line(text, "open" if is_open(index) else "caution"))

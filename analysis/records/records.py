@@ -113,6 +113,10 @@ class Skip(Struct, kw_only=True):
 Shapes = dict[str, dict[str, list[Count]]]
 
 
+BOTH_ENDS = ("eigenvalue_ratio", "negative_ratio")
+DOUBTED = schema.Index(value=None, low=None, high=None, note="renders do not confirm an end")
+
+
 class ProbeRecord(Struct, kw_only=True):
     """Results of `landscape probe`.
 
@@ -150,6 +154,12 @@ class ProbeRecord(Struct, kw_only=True):
     def __post_init__(self) -> None:
         if self.slice and len(self.slice.directions) != 2:
             raise ValueError(f"expected 2 slice.directions, got {len(self.slice.directions)}")
+
+    @property
+    def indices(self) -> dict[str, schema.Index]:
+        """The indices as they are said: a ratio of both ends has no number where renders do not confirm one of them."""
+        found = dict(self.anisotropy.items())
+        return found if self.eigenvalues.stand else found | {name: DOUBTED for name in BOTH_ENDS if name in found}
 
 
 class SliceRecord(Struct, kw_only=True):

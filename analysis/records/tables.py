@@ -90,7 +90,7 @@ def _end_rows(data: ProbeRecord) -> Iterator[Row]:
 
 def _index_rows(data: ProbeRecord) -> Iterator[Row]:
     """Rows of the indices, but for those that the record's notes name as left out."""
-    for name, index in data.anisotropy.items():
+    for name, index in data.indices.items():
         if index.note != NEEDS_DENSITY:
             yield name.replace("_", " "), *_index(index)
 

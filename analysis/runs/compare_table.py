@@ -17,7 +17,7 @@ from analysis.records.findings import attribute_name
 from analysis.records.quantities import PLACES, SCORES, measured, quantity
 from analysis.records.records import ProbeRecord
 from analysis.records.run_files import ENDS, Scores
-from analysis.records.schema import INDICES, Anisotropy, Depth, Effect, End, Index, Operator, Trace
+from analysis.records.schema import INDICES, Anisotropy, Depth, Effect, Eigenvalue, Index, Operator, Trace
 from analysis.records.tables import OPERATOR_NAMES, Cell, bracketed, factor
 from splat.model.typed import leaves
 from splat.training.origin.subject import Checkpoint
@@ -87,14 +87,14 @@ def _scores(runs: Sequence[Run]) -> Iterable[Row]:
 def _curvature(runs: Sequence[Run]) -> Iterable[Row]:
     for name in dict.fromkeys(name for run in runs for name in run.data.traces):
         yield Row("trace", attribute_name(name), tuple(_trace(run.data.traces.get(name)) for run in runs))
-    yield Row("spectrum", ENDS["lambda_max"], tuple(_end(run.data.eigenvalues.max) for run in runs))
-    yield Row("spectrum", ENDS["lambda_min"], tuple(_end(run.data.eigenvalues.min) for run in runs))
+    for name, end in (("lambda_max", "max"), ("lambda_min", "min")):
+        yield Row("spectrum", ENDS[name], tuple(_end(getattr(run.data.eigenvalues, end)) for run in runs))
 
 
 def _indices(runs: Sequence[Run]) -> Iterable[Row]:
     """Each index of the whole Hessian; beneath it what the split multiplies it by, where that was measured."""
     for name in INDICES:
-        entries = tuple(_index(getattr(run.data.anisotropy, name) or None) for run in runs)
+        entries = tuple(_index(run.data.indices.get(name)) for run in runs)
         yield Row("anisotropy", name.replace("_", " "), entries)
         yield from _split("anisotropy", runs, "hessian", "all", name)
 
@@ -164,9 +164,10 @@ def _trace(trace: Trace | None) -> Entry:
     return Entry(trace.value, cell, trace.low, trace.high)
 
 
-def _end(end: End) -> Entry:
+def _end(end: Eigenvalue) -> Entry:
     value, residual = end.value, end.residual
-    cell = Cell(measured(value, residual), "", end.reason or "")
+    said = "not confirmed by renders" if end.renders and not end.renders.confirmed else ""
+    cell = Cell(measured(value, residual), said, end.reason or "")
     if value is None or residual is None:
         return Entry(value, cell)
     return Entry(value, cell, value - residual, value + residual)

@@ -139,6 +139,8 @@ def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, found,
     assert lines["negative"].endswith(f"{who}{other}; {said}")
     assert found in sentences(data) and "λ max / λ min" not in str(lines)
     assert ("times as curved as the steepest up" in sentences(data)) == (confirmed is True)
+    numbers = {name: index.value for name, index in probe_of(data).indices.items()}
+    assert (numbers["negative_ratio"] is None) == (numbers["eigenvalue_ratio"] is None) == (confirmed is not True)
 
 
 @pytest.mark.parametrize(

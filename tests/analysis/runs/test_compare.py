@@ -169,6 +169,20 @@ def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(train
         assert bracketed(Index(value=7 * scale, low=6 * scale, high=9 * scale, note="")).bracket in page
 
 
+def test_no_ratio_is_compared_whose_end_renders_do_not_confirm(runs, tmp_path, capsys, no_pictures):
+    path = Path(runs[0]) / "probe/probe.json"
+    data = json.loads(path.read_text())
+    rendered = {"steps": [1e-3], "optimiser_step": 1e-3, "ratios": [-1.0], "errors": [0.1], "confirmed": False}
+    data["eigenvalues"]["min"]["renders"] = rendered
+    path.write_text(json.dumps(data))
+    assert main(["compare", *runs, "--out", str(tmp_path)]) == 0
+    table = pd.read_csv(tmp_path / "compare.csv").set_index(["section", "quantity", "run"])["value"]
+    for name in ("eigenvalue ratio", "negative ratio"):
+        found = table.loc[("anisotropy", name)].isna()
+        assert found.tolist() == [True, False]
+    assert capsys.readouterr().out.count("not confirmed by renders") == 1
+
+
 def test_runs_with_the_same_parameters_are_said_to_be_the_same(runs, capsys, no_pictures):
     shutil.copy(Path(runs[0]) / "checkpoint.pt", Path(runs[1]) / "checkpoint.pt")
     record(Path(runs[1]) / "probe", 0.5)
