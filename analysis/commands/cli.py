@@ -261,12 +261,16 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
 
 
 def _require_compiler() -> None:
-    """InputError for settings of Numba that keep it from compiling, or that a stranger's folder brings."""
+    """InputError for settings of Numba that keep it from compiling, or that a stranger's folder brings.
+
+    Kernels of another level of optimisation would be kept, and taken from then on.
+    """
     threads = os.environ.get("NUMBA_NUM_THREADS", "1")
     if re.fullmatch(r"-\d+|0+", threads):
         raise InputError(f"expected NUMBA_NUM_THREADS of at least 1, got {threads}; unset it")
-    if (off := os.environ.get("NUMBA_DISABLE_JIT", "0")) not in ("", "0"):
-        raise InputError(f"expected kernels that Numba compiles, got NUMBA_DISABLE_JIT={off}; unset it")
+    for name, usual in (("NUMBA_DISABLE_JIT", "0"), ("NUMBA_OPT", "3")):
+        if (given := os.environ.get(name, "")) not in ("", usual):
+            raise InputError(f"expected kernels as Numba compiles them, got {name}={given}; unset it")
     if (file := Path(".numba_config.yaml")).is_file():
         raise InputError(
             f"expected no settings of Numba in the current folder, got {file}; begin in another, or move it"

@@ -41,9 +41,9 @@ LFS_MAGIC = b"version https://git-lfs"
 SLACK = 2**20  # bytes that any archive may hold
 FOLDER = 0x10  # among the attributes of a member
 PLAIN = re.compile(  # names in a pickle that make nothing larger than what the file holds
-    r"torch (?!\w*Tensor$)\w+|torch\._utils _rebuild_(?!qtensor)\w+|torch\.nn\.parameter Parameter|numpy dtype|"
+    r"torch (?!\w*Tensor$)\w+|torch\._utils _rebuild_(?!qtensor)\w+|torch\.nn\.parameter Parameter|"
     r"torch\.serialization _get_layout|torch\._tensor _rebuild_from_type_v2|numpy\._?core\.multiarray scalar|"
-    r"collections (OrderedDict|Counter)|(builtins|__builtin__) (set|complex)|_codecs encode"
+    r"collections (OrderedDict|Counter)|(builtins|__builtin__) (set|complex)"
 )
 MOST_TEXT = 2**28  # bytes of a file of text
 DEEPEST = 64  # levels of lists and mappings in one; records have at most ten, and Python takes about 300
@@ -99,13 +99,12 @@ def _require_plain(content: bytes) -> None:
             continue
         words = [*words[1:], memo[value] if "GET" in operation.name else (operation.name, value)]
         (kind, name), first, *more = words
-        if kind != "GLOBAL":
-            continue
-        known = PLAIN.fullmatch(name) is not None
-        if name == "numpy dtype":
-            known = re.fullmatch("[bfi][1248]", str(first[1])) is not None
-        elif name == "_codecs encode":
-            known = more == [("BINUNICODE", "latin1"), ("TUPLE2", None)]
+        known = (
+            kind != "GLOBAL"
+            or PLAIN.fullmatch(name)
+            or (name == "numpy dtype" and re.fullmatch("[bfi][1248]", str(first[1])))
+            or (name == "_codecs encode" and more == [("BINUNICODE", "latin1"), ("TUPLE2", None)])
+        )
         if not known:
             raise InputError(
                 f"it holds more than tensors and numbers: a {name.replace(' ', '.')}; save it again without that"

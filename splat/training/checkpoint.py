@@ -7,7 +7,6 @@ which torch omits.  The same training gives the same bytes.
 
 import io
 import sys
-import warnings
 import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,9 +19,10 @@ from torch import Tensor
 
 from landscape.errors import InputError, did_you_mean, lacks_memory
 from splat.model.files.read import is_foreign
+from splat.model.files.tensor_files import loaded
 from splat.model.gaussians import Gaussians
 from splat.model.typed import MOST, Count, leaves, typed
-from splat.model.untrusted import is_of_the_system, require_content, require_whole, write_atomically
+from splat.model.untrusted import is_of_the_system, require_content, write_atomically
 from splat.training.adam import Adam
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
@@ -160,12 +160,12 @@ def open_checkpoint(path: Path, foreign: Foreign, out: Path, train: Sequence[str
     """
     if is_foreign(path):
         return Checkpoint(*foreign_training(path, foreign, out.with_name(f"{out.name}-mismatch.png"), train))
-    loaded, usual = load_checkpoint(path), vars(Foreign())
+    own, usual = load_checkpoint(path), vars(Foreign())
     if needless := [name for name, value in vars(foreign).items() if value != usual[name] and name not in OF_ALL]:
         raise InputError(
             f"expected no --{needless[0].replace('_', '-')} for {path}: a checkpoint of landscape train holds that already"
         )
-    return loaded
+    return own
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
@@ -209,11 +209,7 @@ def _instead(path: Path) -> str:
 def _read(file: BinaryIO, path: Path) -> Any:
     """The content that torch saved, after a test of its checksums."""
     try:
-        with zipfile.ZipFile(file) as archive:
-            require_whole(archive)
-        file.seek(0)
-        with warnings.catch_warnings(action="ignore"):  # torch warns of other kinds of pickle before it refuses them
-            return torch.load(file, map_location="cpu", weights_only=True)
+        return loaded(file)
     except Exception as error:  # files of other kinds fail in torch with errors of many kinds
         if lacks_memory(error) or is_of_the_system(error):
             raise

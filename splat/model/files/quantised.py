@@ -28,7 +28,7 @@ from splat.model.files.ply import Header, read_header, read_rows
 from splat.model.files.splat_file import SplatFile, clamped_note, logit, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00, harmonics
-from splat.model.untrusted import loose_json, open_image
+from splat.model.untrusted import loose_json, open_image, require_modest
 
 SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 CHUNK = 256  # Gaussians of a compressed PLY's chunk
@@ -147,8 +147,7 @@ def read_sog(content: bytes) -> SplatFile:
     """InputError where a texture or a table is smaller than the file says."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if sum(info.file_size for info in archive.infolist()) > 4 * len(content) + (1 << 20):
-                raise InputError("its members are far larger than the file")
+            require_modest(archive)
             meta = loose_json(archive.read("meta.json"))
             _check_sog(meta, {name: archive.read(name) for name in archive.namelist() if name.endswith(".webp")})
     except InputError:

@@ -17,7 +17,7 @@ import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -48,8 +48,8 @@ def is_tensor_file(archive: zipfile.ZipFile) -> bool:
 
 
 def _pickles(archive: zipfile.ZipFile) -> list[str]:
-    infos = {info.filename: info for info in archive.infolist()}
-    return [name for name, info in infos.items() if name.endswith("/data.pkl") and info.file_size < 1 << 26]
+    found = archive.infolist()
+    return [info.filename for info in found if info.filename.endswith("/data.pkl") and info.file_size < 1 << 26]
 
 
 def read_tensor_file(path: Path, content: bytes) -> SplatFile:
@@ -65,20 +65,27 @@ def read_tensor_file(path: Path, content: bytes) -> SplatFile:
 
 
 def load_tensors(content: bytes) -> Any:
-    """Content that `torch.save` wrote, on the CPU.  Its members are as large as in the file, and their checksums right."""
+    """Content that `torch.save` wrote, on the CPU.  InputError where it is none, or holds more than tensors and numbers."""
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            require_whole(archive)
-            if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
-                raise InputError("its members are compressed, which torch.save does not do")
-        with warnings.catch_warnings(action="ignore"), torch.serialization.safe_globals(_numpy_scalars()):
-            return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        with torch.serialization.safe_globals(_numpy_scalars()):
+            return loaded(io.BytesIO(content))
     except InputError:
         raise
     except Exception as error:  # a damaged file fails in torch in many ways
         if lacks_memory(error):
             raise
         raise InputError(f"it is damaged, or holds more than tensors and numbers: {torch_reason(error)}") from error
+
+
+def loaded(file: BinaryIO) -> Any:
+    """As torch loads it, after a test: its members are as large as in the file, and their checksums right."""
+    with zipfile.ZipFile(file) as archive:
+        require_whole(archive)
+        if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+            raise InputError("its members are compressed, which torch.save does not do")
+    file.seek(0)
+    with warnings.catch_warnings(action="ignore"):  # torch warns of other kinds of pickle before it refuses them
+        return torch.load(file, map_location="cpu", weights_only=True)
 
 
 def torch_reason(error: Exception) -> str:

@@ -176,9 +176,8 @@ def test_files_are_read_by_one_module_and_text_is_utf_8():
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Call) and _called(node) in NAMES and _is_bare(node):
                     found.add((path.relative_to(ROOT).as_posix(), ast.unparse(node.func)))
-    of_torch = {("splat/model/files/tensor_files.py", "torch.load"), ("splat/training/checkpoint.py", "torch.load")}
-    of_text = {("splat/scenes/formats/dtu.py", "np.loadtxt")}
-    assert found == {("splat/model/untrusted.py", name) for name in READERS} | of_torch | of_text
+    others = {("splat/model/files/tensor_files.py", "torch.load"), ("splat/scenes/formats/dtu.py", "np.loadtxt")}
+    assert found == {("splat/model/untrusted.py", name) for name in READERS} | others
 
 
 def _called(call: ast.Call) -> str:
