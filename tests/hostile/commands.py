@@ -1,10 +1,13 @@
-"""The commands that write files, on a tiny scene: what is typed, and which numbers they come to."""
+"""The commands that write files, on a tiny scene: what is typed, the numbers they come to, and a program that attacks them."""
 
+import argparse
 import json
 import re
 import shutil
+import tempfile
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from analysis.commands.uses.next_view import RECORD as NEXT
@@ -20,6 +23,9 @@ from splat.model.files.read import read_splats
 from splat.training.checkpoint import load_checkpoint
 from tests.hostile.ended import TRAINED, Ended, Numbers, bytes_of, digest, leaves, recorded, trained
 
+SHOWN = 50  # trials after which the counts are printed
+FAILURE = "failure"
+Trial = tuple[str, Callable[[], str]]  # with words on which it is
 QUICK = "probe {} --quick --slice-points 5 --out {}"
 
 
@@ -173,3 +179,33 @@ KINDS = (
     Paper,
 )
 COMMANDS: dict[str, type[Ended]] = {each.name: each for each in KINDS}
+
+
+def attacked(about: str | None, trials: Callable[[Ended, int, int], Iterable[Trial]], rounds: int, *usual: str) -> int:
+    """The program that attacks commands, the usual ones unless others are named, from a seed; 1 where something went wrong."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("commands", nargs="*", default=usual)
+    parser.add_argument("--rounds", type=int, default=rounds)
+    parser.add_argument("--seed", type=int, default=0)
+    options, wrong = parser.parse_args(), 0
+    for name in options.commands:
+        with tempfile.TemporaryDirectory() as folder:
+            command = COMMANDS[name](Path(folder))
+            print(f"{name}: {command.seconds:.1f} s unended", flush=True)
+            wrong += _failures(name, [*trials(command, options.rounds, options.seed)])
+    return int(wrong > 0)
+
+
+def _failures(name: str, trials: list[Trial]) -> int:
+    """Try each, which says what became of it; what went wrong, and how many went which way, is printed."""
+    outcomes, start = Counter[str](), time.monotonic()
+    for number, (words, trial) in enumerate(trials, 1):
+        try:
+            outcome = trial()
+        except Exception as error:  # whatever it is, it is what is looked for
+            outcome = FAILURE
+            print(f"{name}, {words}: {type(error).__name__} {error}", flush=True)
+        outcomes[outcome] += 1
+        if number % SHOWN == 0 or number == len(trials):
+            print(f"{name}: {number} in {time.monotonic() - start:,.0f} s: {dict(outcomes)}", flush=True)
+    return outcomes[FAILURE]

@@ -1,14 +1,11 @@
 """Commands on a tiny scene that somebody ends at a random moment, and what they come to when nobody does."""
 
-import argparse
 import io
 import json
 import random
 import shutil
 import signal
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,38 +21,7 @@ from tests.hostile.programs import forked, program
 
 CHANGING = ("second", "provenance", "timing", "created", "skipped")  # in the names of what no two runs have alike
 TRAINED = 6  # steps of the run that others read
-SHOWN = 50  # trials after which the counts are printed
 Numbers = dict[str, str]  # what was found, in words, by its name
-
-
-def attempts(name: str, trials: Iterable[tuple[str, Callable[[], str]]]) -> list[str]:
-    """Try each, which says what became of it, and print how many went which way; what went wrong, by the words of the trial."""
-    outcomes, failures, start = Counter[str](), list[str](), time.monotonic()
-
-    def show() -> None:
-        done = f"{outcomes.total() + len(failures)} in {time.monotonic() - start:,.0f} s"
-        print(f"{name}: {done}: {dict(outcomes)}, {len(failures)} failures", flush=True)
-
-    for number, (words, trial) in enumerate(trials, 1):
-        try:
-            outcomes[trial()] += 1
-        except Exception as error:  # whatever it is, it is what is looked for
-            failures.append(f"{name}, {words}: {type(error).__name__} {error}")
-            print(failures[-1], flush=True)
-        if number % SHOWN == 0:
-            show()
-    show()
-    return failures
-
-
-def attacked(about: str | None, attack: Callable[[str, int, int], list[str]], commands: list[str], rounds: int) -> int:
-    """The program that attacks commands so many times, from a seed; 1 where something went wrong."""
-    parser = argparse.ArgumentParser(description=about)
-    parser.add_argument("commands", nargs="*", default=commands)
-    parser.add_argument("--rounds", type=int, default=rounds)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    return int(sum(len(attack(name, options.rounds, options.seed)) for name in options.commands) > 0)
 
 
 class Ended:
@@ -124,7 +90,7 @@ class Ended:
         before, apart = self.out.exists(), chance.random() < self.apart
         process = program(self.words(), self.module.__name__) if apart else self.begun()
         time.sleep(chance.random() * (self.seconds + 3 * apart))
-        process.send(number)
+        process.send_signal(number)
         code = process.wait()
         allowed = {-number, 0} if number == signal.SIGKILL else {-number, 128 + number, 0}
         assert code in allowed, f"exit code {code}"
@@ -137,7 +103,7 @@ class Ended:
         self.run_to_its_end()
         self.require_expected("after the same command again")
         assert (left := sorted(path.name for path in self.out.parent.iterdir())) == ["out"], f"left: {left}"
-        return "had ended" if code == 0 else "ended and went on to the same bits"
+        return f"{signal.Signals(number).name}: " + ("had ended" if code == 0 else "ended and went on to the same bits")
 
     def check(self) -> None:
         """What lies there although the command did not come to its end must be whole."""

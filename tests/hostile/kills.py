@@ -10,35 +10,22 @@ its own, which does.
 import random
 import signal
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 
-from tests.hostile.commands import COMMANDS
-from tests.hostile.ended import Ended, attacked, attempts
+from tests.hostile.commands import COMMANDS, Trial, attacked
+from tests.hostile.ended import Ended
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
-def attack(name: str, rounds: int, seed: int) -> list[str]:
-    """So many kills and as many signals; what went wrong."""
-
-    def trials(command: Ended) -> Iterator[tuple[str, Callable[[], str]]]:
-        for round in range(2 * rounds):
-            chance = random.Random(f"{name} {seed} {round}")
-            number = signal.SIGKILL if round % 2 else chance.choice(SIGNALS)
-            yield f"round {round}, {signal.Signals(number).name}", partial(_ended, command, chance, number)
-
-    with tempfile.TemporaryDirectory() as folder:
-        command = COMMANDS[name](Path(folder))
-        print(f"{name}: {command.seconds:.1f} s unended", flush=True)
-        return attempts(name, trials(command))
-
-
-def _ended(command: Ended, chance: random.Random, number: int) -> str:
-    return f"{'kill' if number == signal.SIGKILL else 'signal'}: {command.round(chance, number)}"
+def trials(command: Ended, rounds: int, seed: int) -> Iterator[Trial]:
+    """So many kills and as many signals."""
+    for round in range(2 * rounds):
+        chance = random.Random(f"{command.name} {seed} {round}")
+        number = signal.SIGKILL if round % 2 else chance.choice(SIGNALS)
+        yield f"round {round}, {signal.Signals(number).name}", partial(command.round, chance, number)
 
 
 if __name__ == "__main__":
-    sys.exit(attacked(__doc__, attack, [*COMMANDS], 50))
+    sys.exit(attacked(__doc__, trials, 50, *COMMANDS))

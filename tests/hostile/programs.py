@@ -48,27 +48,19 @@ class forked:
         os.read(ready, 1)
         os.close(ready)
 
-    def send(self, number: int) -> None:
+    def send_signal(self, number: int) -> None:
         os.kill(self.process, number)
 
     def wait(self) -> int:
         return os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
 
-    def ended(self) -> int | None:
+    def poll(self) -> int | None:
         """The exit code of one that has come to its end."""
         process, status = os.waitpid(self.process, os.WNOHANG)
         return os.waitstatus_to_exitcode(status) if process else None
 
 
-class program:
+def program(words: list[str], module: str = cli.__name__) -> subprocess.Popen[bytes]:
     """The command as a program of its own; module: whose."""
-
-    def __init__(self, words: list[str], module: str = cli.__name__) -> None:
-        command = [sys.executable, "-m", module, *words]
-        self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-    def send(self, number: int) -> None:
-        self.process.send_signal(number)
-
-    def wait(self) -> int:
-        return self.process.wait()
+    command = [sys.executable, "-m", module, *words]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

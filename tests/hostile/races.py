@@ -8,37 +8,35 @@ say why in one sentence.  The numbers in the end must be the bits of one that wa
 import random
 import signal
 import sys
-import tempfile
 import time
+from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 
-from tests.hostile.commands import COMMANDS
-from tests.hostile.ended import Ended, attacked, attempts
+from tests.hostile.commands import Trial, attacked
+from tests.hostile.ended import Ended
 from tests.hostile.programs import forked
 
 BAD_INPUT = 2
 
 
-def race(command: Ended, chance: random.Random, files: Path) -> str:
+def race(command: Ended, chance: random.Random) -> str:
     """What became of the two."""
     command.prepare(chance)
     if command.goes_on and chance.random() < 0.5:
         before = command.begun()
         time.sleep(chance.random() * command.seconds)
-        before.send(signal.SIGTERM)
+        before.send_signal(signal.SIGTERM)
         before.wait()
-    said = [files / "first", files / "second"]
+    said = [command.scene.with_name(name) for name in ("first", "second")]
     words = command.words()
     first = forked(lambda: command.module.main(words), said[0])
-    time.sleep(
-        chance.choice((0, 0.01, 0.1, chance.random() * command.seconds, chance.uniform(0.9, 1.1) * command.seconds))
-    )
+    late = (0, 0.01, 0.1, chance.random() * command.seconds, chance.uniform(0.9, 1.1) * command.seconds)
+    time.sleep(chance.choice(late))
     second = forked(lambda: command.module.main(words), said[1])
     both, codes = [first, second], dict[int, int]()
     while len(codes) < 2:
         for i, process in enumerate(both):
-            if i not in codes and (code := process.ended()) is not None:
+            if i not in codes and (code := process.poll()) is not None:
                 codes[i] = code
         if command.goes_on and command.out.exists():  # else a folder is replaced, whose files a reader may lose
             command.check()
@@ -54,15 +52,10 @@ def race(command: Ended, chance: random.Random, files: Path) -> str:
     return "one was refused" if lost else "both did it, one after the other"
 
 
-def attack(name: str, rounds: int, seed: int) -> list[str]:
-    """So many races; what went wrong."""
-    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as files:
-        command = COMMANDS[name](Path(folder))
-        chances = (random.Random(f"race {name} {seed} {round}") for round in range(rounds))
-        return attempts(
-            name, ((f"round {i}", partial(race, command, chance, Path(files))) for i, chance in enumerate(chances))
-        )
+def trials(command: Ended, rounds: int, seed: int) -> Iterator[Trial]:
+    for round in range(rounds):
+        yield f"round {round}", partial(race, command, random.Random(f"race {command.name} {seed} {round}"))
 
 
 if __name__ == "__main__":
-    sys.exit(attacked(__doc__, attack, ["train"], 1000))
+    sys.exit(attacked(__doc__, trials, 1000, "train"))

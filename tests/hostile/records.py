@@ -9,7 +9,10 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from rich.console import Console
 
+from analysis.records.page import report
+from analysis.records.records import ProbeRecord, SliceRecord, read_record
 from splat.scenes.view import View
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.loop import train
@@ -17,6 +20,7 @@ from splat.training.origin.subject import Checkpoint
 from splat.training.state import Training
 from tests.hostile.broken import Read, Reader
 from tests.hostile.mutations import Random
+from tests.recorded import synthetic, synthetic_line, written, written_map
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
 DRAWN = 0.01  # of the records that are accepted are drawn too, which takes most of the time
@@ -60,11 +64,7 @@ def _write_probes(root: Path) -> None:
 
 
 def _use_probes(root: Path, chance: Random) -> Read:
-    from rich.console import Console
-
     from analysis.records.findings import findings
-    from analysis.records.page import report
-    from analysis.records.records import ProbeRecord, read_record
     from analysis.records.tables import family_table, probe_table
     from analysis.runs.compare import cautions, render_page
     from analysis.runs.compare_table import Run, compare_table, comparison, frame
@@ -102,14 +102,10 @@ def _draw(record: Any, chance: Random) -> None:
 
 
 def _write_slice(root: Path) -> None:
-    from tests.recorded import synthetic_line
-    from tests.recorded import written as recorded
-
-    recorded(root / "slice", *synthetic_line())
+    written(root / "slice", *synthetic_line())
 
 
 def _use_slice(root: Path, chance: Random) -> Read:
-    from analysis.records.records import SliceRecord, read_record
     from analysis.slice.command import _conclude
 
     record = read_record(root / "slice", SliceRecord)
@@ -119,18 +115,14 @@ def _use_slice(root: Path, chance: Random) -> Read:
 
 
 def _write_origin(root: Path) -> None:
-    from tests.recorded import synthetic
-    from tests.recorded import written as recorded
-
     data, arrays = synthetic()
     preset = {"render": {"antialias": "none"}, "loss": {"opacity_reg": 0.0, "scale_reg": 0.01}}
     origin = {"trained_by": "gsplat", "images": None, "downscale": 2.0, "preset": preset, "notes": ["assumed"]}
     data["provenance"] |= {"origin": origin, "scene_folder": "fern", "views": ["a.png"]}
-    recorded(root / "probe", data, arrays)
+    written(root / "probe", data, arrays)
 
 
 def _use_origin(root: Path, chance: Random) -> Read:
-    from analysis.records.records import ProbeRecord, read_record
     from analysis.runs.compared import _as_probed
 
     made = read_record(root / "probe", ProbeRecord).data.provenance
@@ -143,7 +135,6 @@ def _write_map(root: Path) -> None:
     from analysis.records.json_files import plain
     from splat.training.origin.fingerprint import Fingerprint
     from tests.analysis.records.test_report import with_views
-    from tests.recorded import synthetic, written_map
 
     data, _ = synthetic()
     data["provenance"]["fingerprint"] = plain(Fingerprint({}, {}, "00"))
@@ -152,9 +143,6 @@ def _write_map(root: Path) -> None:
 
 
 def _use_map(root: Path, chance: Random) -> Read:
-    from analysis.records.page import report
-    from analysis.records.records import read_record
-
     with patch.object(report, "interactive_surface", return_value=None):
         text = report.render_report(read_record(root / "probe"))
     assert text.rstrip().endswith("</html>") and "photograph" in text, "a page without its own pictures"
@@ -227,8 +215,6 @@ def _write_study(root: Path) -> None:
 
 
 def _use_study(root: Path, chance: Random) -> Read:
-    from rich.console import Console
-
     from notebooks.paper.__main__ import tell
     from notebooks.paper.figures import captions
     from notebooks.paper.predictors import predictors
