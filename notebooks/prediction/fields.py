@@ -11,6 +11,9 @@ random Fourier features (Rahimi and Recht 2007).  It moves every Gaussian by its
 
 S = E[L(Theta + d phi(mu))] - L(Theta) on the training views, and E |R(Theta + d phi(mu)) - R(Theta)|_1 at new poses, where d
 is SIZES.  Each draw is the mean over phi and -phi, in which the slope of L cancels.
+
+No two halves give quite the images of the whole (`analysis/measures/split_control.py`).  Those of all of fern's Gaussians (126
+x 94, 2,000 steps) raise the loss itself by 25%; they change S by -12% and the images' change by +7%, of errors of 5% and 1%.
 """
 
 from collections.abc import Mapping, Sequence

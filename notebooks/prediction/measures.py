@@ -29,7 +29,7 @@ from splat.render.backend import backend_of
 
 DEPTH = 0.01  # s
 KEPT = 0.5  # share of the Gaussians in a random subset
-CLOSE, MOST = 0.01, 40  # of the slope that may be left at eta; losses
+CLOSE, MOST = 0.01, 40  # of the slope that may be left at eta, or of eta itself; losses
 
 
 def order_fragility(
@@ -61,8 +61,8 @@ def critical_sharpness(
     """2 / eta along the next update, start - eta step.  slope: gradient . step.  error: of the search for eta.
 
     (loss - loss at the start) / eta is -slope at 0, and a straight line where the loss is quadratic: its zero is found by
-    regula falsi with Illinois' halving.  Both nan where the loss does not fall along the update.
-    InputError where it still falls after MOST losses.
+    regula falsi with Illinois' halving, or the place where it jumps past 0.  Both nan where the loss does not fall along
+    the update.  InputError where it still falls after MOST losses.
     """
     if slope <= 0:
         return Measured(nan, nan)
@@ -76,6 +76,9 @@ def critical_sharpness(
         else:
             near, far = (near[0], near[1] / 2 if side > 0 else near[1]), (eta, rate)
         side = 1 if rate > 0 else -1
+        if far and far[0] - near[0] <= CLOSE * far[0]:  # the loss jumps here: Gaussians change places
+            eta = (near[0] + far[0]) / 2
+            return Measured(2 / eta, 2 / eta * (far[0] - near[0]) / (2 * near[0]))
         eta = 2 * eta if far is None else near[0] - near[1] * (far[0] - near[0]) / (far[1] - near[1])
     raise InputError(f"expected a loss that rises along the update, got one that falls at {eta:.3g} times it")
 

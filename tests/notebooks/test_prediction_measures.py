@@ -141,6 +141,8 @@ def test_critical_sharpness_of_a_quadratic_loss_is_its_curvature_along_the_updat
         )
     quartic = critical_sharpness(lambda x: float((x**4).sum()), torch.ones(1, dtype=DOUBLE), torch.ones(1), 4.0)
     assert quartic.value == pytest.approx(1.0, abs=0.02)  # it is 1 again at -1
+    jump = critical_sharpness(lambda x: float(x) + 2 * float(x < 0.4), torch.ones(1), torch.ones(1), 1.0)
+    assert jump.value == pytest.approx(2 / 0.6, abs=jump.error) and jump.error < 0.02 * jump.value
     assert np.isnan(critical_sharpness(lambda x: float(x.sum()), start, -start.abs(), -1.0)).all()
 
 
