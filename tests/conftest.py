@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
 from tests.splat.gpu.interpreted import interpreter, unwritten
 
 if not torch.cuda.is_available():
@@ -34,6 +36,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if test in interpreted and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="without a GPU the first case stands for all"))
         interpreted.add(test)
+
+
+@pytest.fixture(scope="session")
+def original(tmp_path_factory) -> Path:
+    """A scene of five views of 24 x 18 px, which tests leave as it is."""
+    folder = tmp_path_factory.mktemp("scenes") / "still"
+    write_transforms_scene(synthetic_scene(SyntheticSettings(gaussians=60, views=5, width=24, height=18)).scene, folder)
+    return folder
 
 
 def _real_scene(name: str) -> Path:

@@ -4,6 +4,7 @@ import os
 import re
 import resource
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,8 +17,6 @@ import pytest
 from analysis.commands.cli import main
 from landscape.errors import InputError
 from splat.model.untrusted import beside, locked
-from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
-from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
 from tests.waiting import PATIENCE, waits_for
 
@@ -27,10 +26,8 @@ LONG = ["--iterations", "100000", "--checkpoint-every", "1000000", "--log-every"
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("scenes") / "still [v2]"
-    write_transforms_scene(synthetic_scene(SyntheticSettings(gaussians=60, views=5, width=24, height=18)).scene, folder)
-    return folder
+def scene(original) -> Path:
+    return Path(shutil.copytree(original, original.with_name("still [v2]")))
 
 
 @pytest.fixture(scope="session")
