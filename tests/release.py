@@ -24,7 +24,7 @@ PAGES = (
     "docs/methods",
     "docs/other-tools",
 )
-SHORT = {"train": ["--iterations", "20"], "probe": ["--quick"], "view": ["--html", "view.html"]}  # words that end a command soon
+SHORT = {"train": ["--iterations", "20"], "probe": ["--quick"], "view": ["--html", "view.html"]}  # which end them soon
 BLOCK = re.compile(r"^```python\n(.*?)^```|^    (landscape [^\n]*)$", re.M | re.S)
 
 
