@@ -261,10 +261,8 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
 
 
 def _require_compiler() -> None:
-    """InputError for settings of Numba that keep it from compiling, or that a stranger's folder brings.
-
-    Kernels of another level of optimisation would be kept, and taken from then on.
-    """
+    """InputError for settings of Numba that keep it from compiling, that its kept kernels would have from then on, or that a
+    stranger's folder brings."""
     threads = os.environ.get("NUMBA_NUM_THREADS", "1")
     if re.fullmatch(r"-\d+|0+", threads):
         raise InputError(f"expected NUMBA_NUM_THREADS of at least 1, got {threads}; unset it")

@@ -22,7 +22,7 @@ from splat.model.files.read import is_foreign
 from splat.model.files.tensor_files import loaded
 from splat.model.gaussians import Gaussians
 from splat.model.typed import MOST, Count, leaves, typed
-from splat.model.untrusted import is_of_the_system, require_content, write_atomically
+from splat.model.untrusted import require_content, write_atomically
 from splat.training.adam import Adam
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
@@ -210,15 +210,12 @@ def _read(file: BinaryIO, path: Path) -> Any:
     """The content that torch saved, after a test of its checksums."""
     try:
         return loaded(file)
-    except Exception as error:  # files of other kinds fail in torch with errors of many kinds
-        if lacks_memory(error) or is_of_the_system(error):
-            raise
+    except InputError as error:
         runs = [folder for folder in path.absolute().parents[:2] if (folder / FILE).is_file()]
         if runs and path.name != FILE and not zipfile.is_zipfile(path):
             raise InputError(f"{KIND}, got {path}, another file of the run {runs[0]}; name that run") from error
         ply = " (of other tools' files, probe, slice and convert read those)" if path.suffix.lower() == ".ply" else ""
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise InputError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {reason}; {REMEDY}") from error
+        raise InputError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {error}; {REMEDY}") from error
 
 
 def _checkpoint(content: Any) -> Checkpoint:

@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -37,10 +37,9 @@ def run(scene) -> Path:
     return out
 
 
-def started(words: list[str], **settings) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*COMMAND, *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **settings
-    )
+def started(words: list[str], command: Sequence[str] = COMMAND, **settings) -> subprocess.Popen[str]:
+    pipe = subprocess.PIPE
+    return subprocess.Popen([*command, *words], cwd=ROOT, stdout=pipe, stderr=pipe, text=True, **settings)
 
 
 def stepped(run: Path) -> bool:
@@ -184,12 +183,7 @@ def test_two_compile_a_kernel_at_once_and_a_cut_file_is_compiled_anew(tmp_path):
         "@kernel\ndef twice(x):\n    return 2 * x\nprint(twice(4.0))\n"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
-
-    def begun(**settings) -> subprocess.Popen[str]:
-        words = [sys.executable, str(tmp_path / "small.py")]
-        pipe = subprocess.PIPE
-        return subprocess.Popen(words, cwd=ROOT, env=environment, stdout=pipe, stderr=pipe, text=True, **settings)
-
+    begun = partial(started, [str(tmp_path / "small.py")], [sys.executable], env=environment)
     said = begun(preexec_fn=limited(100)).communicate(timeout=PATIENCE)[1]
     assert "File too large" in said and str(tmp_path / "cache") in said.splitlines()[-1]
     cold = [begun(), begun()]
@@ -202,7 +196,7 @@ def test_two_compile_a_kernel_at_once_and_a_cut_file_is_compiled_anew(tmp_path):
 
 @pytest.mark.parametrize("words", [["train", "--help"], ["train", "nowhere"]])
 def test_output_that_nobody_reads_is_no_error(words):
-    command = " ".join([sys.executable, "-m", "analysis.commands.cli", *words])
+    command = " ".join([*COMMAND, *words])
     for pipe in ("| true; exit ${PIPESTATUS[0]}", ">&-"):
         done = subprocess.run(["bash", "-c", f"{command} {pipe}"], cwd=ROOT, capture_output=True, text=True)
         assert done.returncode in ((0, 141) if words[1] == "--help" else (2,)) and "Traceback" not in done.stderr

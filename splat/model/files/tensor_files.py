@@ -27,7 +27,7 @@ from landscape.errors import InputError, lacks_memory
 from splat.model.files.splat_file import SplatFile, finite_logits, names_of, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
-from splat.model.untrusted import require_whole
+from splat.model.untrusted import is_of_the_system, require_whole
 
 UNAPPLIED = "{}, which changed its images in training, is not applied"
 RANK = re.compile(r"(.*_rank)(\d+)(\.pt)")
@@ -65,27 +65,28 @@ def read_tensor_file(path: Path, content: bytes) -> SplatFile:
 
 
 def load_tensors(content: bytes) -> Any:
-    """Content that `torch.save` wrote, on the CPU.  InputError where it is none, or holds more than tensors and numbers."""
-    try:
-        with torch.serialization.safe_globals(_numpy_scalars()):
-            return loaded(io.BytesIO(content))
-    except InputError:
-        raise
-    except Exception as error:  # a damaged file fails in torch in many ways
-        if lacks_memory(error):
-            raise
-        raise InputError(f"it is damaged, or holds more than tensors and numbers: {torch_reason(error)}") from error
+    """As `loaded`, with NumPy's numbers."""
+    with torch.serialization.safe_globals(_numpy_scalars()):
+        return loaded(io.BytesIO(content))
 
 
 def loaded(file: BinaryIO) -> Any:
-    """As torch loads it, after a test: its members are as large as in the file, and their checksums right."""
-    with zipfile.ZipFile(file) as archive:
-        require_whole(archive)
-        if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
-            raise InputError("its members are compressed, which torch.save does not do")
-    file.seek(0)
-    with warnings.catch_warnings(action="ignore"):  # torch warns of other kinds of pickle before it refuses them
-        return torch.load(file, map_location="cpu", weights_only=True)
+    """Content that `torch.save` wrote, on the CPU.  InputError that says why there is none.
+
+    Its members are as large as in the file, and their checksums right, which torch does not test.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            require_whole(archive)
+            if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+                raise InputError("its members are compressed, which torch.save does not do")
+        file.seek(0)
+        with warnings.catch_warnings(action="ignore"):  # torch warns of other kinds of pickle before it refuses them
+            return torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file, or one of another kind, fails in torch in many ways
+        if isinstance(error, InputError) or lacks_memory(error) or is_of_the_system(error):
+            raise
+        raise InputError(f"torch does not load it: {torch_reason(error)}") from error
 
 
 def torch_reason(error: Exception) -> str:

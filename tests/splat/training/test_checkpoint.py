@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from landscape.errors import InputError
-from splat.model.files.tensor_files import load_tensors
 from splat.training.checkpoint import VERSION, load_checkpoint, save_checkpoint, write_atomically
 from splat.training.loop import train
 from splat.training.state import Training
@@ -97,9 +96,9 @@ PLY = b"ply\nformat binary_little_endian 1.0\n"
 def test_a_file_of_another_kind_is_refused_and_what_was_wrong_is_kept(tmp_path, content):
     path = tmp_path / ("point_cloud.ply" if content == PLY else "checkpoint.pt")
     path.write_bytes(content)
-    of = r" \(of other tools" if content == PLY else ": File is not a zip file; take another copy of the file"
+    of = r" \(of other tools" if content == PLY else ": torch does not load it: File is not a zip file; take another"
     caught = refused(path, f"expected a checkpoint written by landscape train.*damaged{of}")
-    assert content == PLY or isinstance(caught.__cause__, zipfile.BadZipFile)
+    assert content == PLY or isinstance(caught.__cause__.__cause__, zipfile.BadZipFile)
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO])
@@ -180,8 +179,6 @@ def test_a_member_that_torch_would_not_read_is_refused(path, place, value):
     content[entry + place : entry + place + 4] = value.to_bytes(4, "little")
     path.write_bytes(content)
     refused(path, "marked as a folder, or promises other bytes than it has")
-    with pytest.raises(InputError, match="marked as a folder"):
-        load_tensors(bytes(content))
 
 
 def test_an_archive_that_torch_stumbles_over_in_its_own_way_is_refused(path):
