@@ -93,7 +93,7 @@ def _require_plain(content: bytes) -> None:
     """
     memo: dict[Any, tuple[str, Any]] = {}
     words: list[tuple[str, Any]] = [("", None)] * 4  # the last operations, and what they name
-    for operation, value, _ in chain(pickletools.genops(content), [(pickletools.code2op["."], None, None)] * 3):
+    for operation, value, _ in chain(pickletools.genops(content), [(pickletools.opcodes[0], None, None)] * 3):
         if "PUT" in operation.name:
             memo[value] = words[-1]
             continue
