@@ -64,7 +64,7 @@ class Example:
         for key in self.reader.part[:-1]:
             inner = inner[key]
         inner[self.reader.part[-1]] = mutations.of_tree(chance, inner[self.reader.part[-1]])
-        return json.dumps(content).encode("utf-8", "surrogatepass"), False
+        return mutations.json_of(content), False
 
     def _put(self, name: str, content: bytes) -> None:
         (self.root / name).unlink()  # some file systems wait for the disk when a file is written over

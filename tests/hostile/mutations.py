@@ -171,11 +171,11 @@ def odd_tensor(chance: Random, value: Any) -> Any:
     return chance.choice(made)()
 
 
-def _json(chance: Random, content: bytes) -> bytes:
+def json_of(tree: Any) -> bytes:
     try:
-        return json.dumps(of_tree(chance, json.loads(content))).encode("utf-8", "surrogatepass")
+        return json.dumps(tree).encode("utf-8", "surrogatepass")
     except RecursionError:  # buried twice, deeper than the encoder goes
-        return b"[" * DEPTHS[-1] + content + b"]" * DEPTHS[-1]
+        return b"[" * DEPTHS[-1] + b"]" * DEPTHS[-1]
 
 
 def _npy(chance: Random, content: bytes) -> bytes:
@@ -231,6 +231,7 @@ def rezipped(chance: Random, content: bytes) -> bytes:
 
 
 STRUCTURES: dict[str, Callable[[Random, bytes], bytes]] = {
-    ".json": _json, ".npy": _npy, ".npz": _npz, ".pt": _of_torch, ".pth": _of_torch, ".ckpt": _of_torch, ".sog": _sog,
+    ".json": lambda chance, content: json_of(of_tree(chance, json.loads(content))), ".npy": _npy, ".npz": _npz,
+    ".pt": _of_torch, ".pth": _of_torch, ".ckpt": _of_torch, ".sog": _sog,
     ".spz": lambda chance, content: gzip.compress(of_bytes(chance, gzip.decompress(content)), 1),
 }  # fmt: skip
