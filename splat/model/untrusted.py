@@ -106,9 +106,7 @@ def _require_plain(content: bytes) -> None:
             or (name == "_codecs encode" and more == [("BINUNICODE", "latin1"), ("TUPLE2", None)])
         )
         if not known:
-            raise InputError(
-                f"it holds more than tensors and numbers: a {name.replace(' ', '.')}; save it again without that"
-            )
+            raise InputError(f"more than tensors and numbers: a {name.replace(' ', '.')}; save it again without that")
 
 
 def require_held(file: BinaryIO, size: int) -> np.dtype:

@@ -24,7 +24,6 @@ from splat.training.checkpoint import load_checkpoint
 from tests.hostile.ended import TRAINED, Ended, Numbers, bytes_of, digest, leaves, recorded, trained
 
 SHOWN = 50  # trials after which the counts are printed
-FAILURE = "failure"
 Trial = tuple[str, Callable[[], str]]  # with words on which it is
 QUICK = "probe {} --quick --slice-points 5 --out {}"
 
@@ -203,9 +202,9 @@ def _failures(name: str, trials: list[Trial]) -> int:
         try:
             outcome = trial()
         except Exception as error:  # whatever it is, it is what is looked for
-            outcome = FAILURE
+            outcome = "failure"
             print(f"{name}, {words}: {type(error).__name__} {error}", flush=True)
         outcomes[outcome] += 1
         if number % SHOWN == 0 or number == len(trials):
             print(f"{name}: {number} in {time.monotonic() - start:,.0f} s: {dict(outcomes)}", flush=True)
-    return outcomes[FAILURE]
+    return outcomes["failure"]

@@ -101,10 +101,6 @@ def _draw(record: Any, chance: Random) -> None:
                 plt.close(FIGURES[name](record))
 
 
-def _write_slice(root: Path) -> None:
-    written(root / "slice", *synthetic_line())
-
-
 def _use_slice(root: Path, chance: Random) -> Read:
     from analysis.slice.command import _conclude
 
@@ -286,7 +282,7 @@ RECORDS = {
     "probe's *.npz": Reader(_write_probes, _use_probes, ARRAYS, ARRAYS),
     "fingerprint": Reader(_write_probes, _use_probes, PROBE, part=("provenance", "fingerprint")),
     "origin": Reader(_write_origin, _use_origin, PROBE, part=("provenance", "origin")),
-    "slice.json, slice.npz": Reader(_write_slice, _use_slice, "slice/*"),
+    "slice.json, slice.npz": Reader(lambda root: written(root / "slice", *synthetic_line()), _use_slice, "slice/*"),
     "map.json, map/*.npz, *.png": Reader(_write_map, _use_map, "map/*", refuses=False),
     "metrics.json, seconds.json, compare.json": Reader(_write_numbers_of_a_run, _use_numbers_of_a_run, "*.json"),
     "trajectory.csv": Reader(_write_trajectory, _use_trajectory, "trajectory.csv"),
