@@ -2,7 +2,7 @@
 
 order fragility     E |R(Theta; z e^(s xi)) - R(Theta; z)|_1, xi ~ N(0, 1) for each Gaussian: the depths z by which they are
                     sorted change, nothing else does; every derivative misses it
-critical sharpness  2 / eta, eta the factor of the next update at which the loss is again what it was before it (arXiv
+critical sharpness  2 / eta, eta the factor of an update at which the loss is again what it was before it (arXiv
                     2601.16979): of a quadratic loss, step^T H step / gradient . step
 open curvature      U, the mean over pixels of new poses of tr J_p (G + prior)^-1 J_p^T, in blocks of Gaussians, with the
                     information G = J^T J of the training views and the prior of `splat.curvature.scores.information`; and its

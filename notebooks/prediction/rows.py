@@ -21,6 +21,7 @@ from notebooks.prediction.fields import field_sharpness
 from notebooks.prediction.measures import coadaptation, critical_sharpness, ensemble, open_curvature, order_fragility
 from notebooks.prediction.poses import Measured, Poses
 from splat import open_subject
+from splat.backend.cpu.adam import BETA1
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
@@ -106,14 +107,18 @@ def curvature(objective: SceneObjective, training: Training) -> Row:
 
 
 def along_the_update(objective: SceneObjective, training: Training) -> Measured:
-    """Critical sharpness along Adam's next update, with the gradient of all training views and the moments as they are."""
+    """Critical sharpness along Adam's next update, with the gradient of all training views for its first moment too.
+
+    Along a momentum of single views the loss need not fall, and the sharpness is then undefined.
+    """
     active = training.gaussians.select(objective.mask)  # as stored, quaternions too: the moments are of these
     at, count, gradient = objective.linearizer(active), len(objective.views), torch.zeros_like(active.flat)
     for index in range(count):
         gradient += at(index).gradient / count
     rates = training.gaussians.with_flat(training.rates(training.step)).select(objective.mask).flat
-    first, second = (moment.select(objective.mask) for moment in (training.adam.first, training.adam.second))
+    second, updates = training.adam.second.select(objective.mask), training.adam.updates
+    first = active.with_flat(gradient * (1 - BETA1**updates))  # of so many equal gradients
     after = active.flat.clone()
-    Adam(first, second, training.adam.updates).update(after, gradient, rates)
+    Adam(first, second, updates).update(after, gradient, rates)
     step = active.flat - after
     return critical_sharpness(objective.loss, active.flat, step, float(gradient.double() @ step.double()))

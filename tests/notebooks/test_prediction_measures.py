@@ -18,6 +18,7 @@ from notebooks.prediction import __main__ as command
 from notebooks.prediction.fields import PARTS, field_sharpness, pixel_lengths, smooth_field, step
 from notebooks.prediction.measures import coadaptation, critical_sharpness, ensemble, open_curvature, order_fragility
 from notebooks.prediction.poses import Poses, distance
+from notebooks.prediction.rows import along_the_update
 from splat.curvature.fields import complement
 from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.information import PRIOR
@@ -27,7 +28,8 @@ from splat.render.render import render, render_layers
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
-from tests.splat.tiny import SMOOTH, tiny_gaussians, tiny_views
+from splat.training.state import Training
+from tests.splat.tiny import EXTENT, SMOOTH, ended, tiny_config, tiny_gaussians, tiny_views
 
 DOUBLE = torch.float64
 SQUARED = LossSettings("l2", ssim_weight=0.0)
@@ -190,6 +192,18 @@ def test_open_curvature_is_the_trace_of_the_dense_jacobians():
     found, ratio = open_curvature(gaussians, train, new)
     assert found.value == pytest.approx(U[2], rel=1e-5)
     assert ratio == pytest.approx(U[2] / np.mean(U[:2]), rel=1e-5)
+
+
+def test_the_update_of_critical_sharpness_lowers_the_loss_whatever_the_momentum_is():
+    training, views = Training.start(tiny_gaussians(), EXTENT, tiny_config(4)), tiny_views()
+    ended(training, views)
+    objective = training.config.objective(training.gaussians, views)
+    first = training.adam.first
+    found = []
+    for momentum in (first, first.with_flat(-100 * first.flat)):
+        training.adam.first = momentum
+        found.append(along_the_update(objective, training))
+    assert found[0] == found[1] and found[0].value > 0
 
 
 SWEEP = """
