@@ -174,12 +174,12 @@ def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
 
 def _apart(runs: Sequence[Run]) -> list[str]:
     """What differs between the probes, part by part of their fingerprints: views, settings, formulas."""
-    found = [made for run in runs if (made := run.data.provenance.fingerprint)]
-    lines = []
-    for run, made in zip(runs, found, strict=True):
+    pairs = [(run, made) for run in runs if (made := run.data.provenance.fingerprint)]
+    found, labels, lines = [made for _, made in pairs], [run.label for run, _ in pairs], []
+    for run, made in pairs:
         views = run.checkpoint.scene.views
         trained = {name: views[name] for name in made.data if name in views}
-        for words, views in (("of its training", trained), (f"of {runs[0].label}", found[0].data)):
+        for words, views in (("of its training", trained), (f"of {labels[0]}", found[0].data)):
             if moved := changes({name: view for name, view in views.items() if name in made.data}, made.data):
                 lines.append(f"The views of {run.label}'s probe are not those {words}: {in_short(moved)}.")
     asked = [
@@ -191,8 +191,9 @@ def _apart(runs: Sequence[Run]) -> list[str]:
         if any(settings.get(name) != asked[0].get(name) for settings in asked)
     ]
     if different:
-        order = ", ".join(run.label for run in runs)
-        lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
+        lines.append(
+            f"The probes were run with different settings (those of {', '.join(labels)}): {'; '.join(different)}."
+        )
     if len(versions := sorted({made.formulas for made in found})) > 1:
         lines.append(f"The probes are of versions {', '.join(map(str, versions))} of the formulas: probe again.")
     return lines
