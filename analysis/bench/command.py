@@ -36,7 +36,7 @@ ON_CPU = (("gradient", "rasterizer", 2.5), ("H v 1", "gradient", 1.6), ("H v 4",
 ON_GPU = (("H v 1", "gradient", 2.0), ("H v 8", "gradient", 1.2))
 # and of bytes: kept by a linearisation, for a visible Gaussian, a pixel and a tile entry; the same for the workspace of each
 # vector of a product.  10,000 Gaussians at 504 x 378 take 0.55 of the first and 0.74 of the second in single precision.
-# A GPU differentiates SSIM of whole planes at once: on an H100 these two scenes took 0.9 and 0.8 of its allowance.
+# A GPU differentiates SSIM of whole planes at once: on an H100 the scenes of SIZES took 0.9 and 0.8 of its allowance.
 KEPT, WORKSPACE, GPU_WORKSPACE = (1000, 200, 24), (500, 28, 40), (100, 145, 40)
 
 

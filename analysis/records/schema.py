@@ -227,6 +227,11 @@ class Eigenvalue(End, kw_only=True):
     renders: Maybe[Renders] = UNSET
     carrier: Maybe[Carries] = UNSET
 
+    @property
+    def doubted(self) -> bool:
+        """Whether it was rendered without being confirmed."""
+        return bool(self.renders and not self.renders.confirmed)
+
 
 class Eigenvalues(Named[Eigenvalue], kw_only=True):
     """The two largest and the smallest, and both ends by the paper's power iteration."""
@@ -239,8 +244,8 @@ class Eigenvalues(Named[Eigenvalue], kw_only=True):
 
     @property
     def stand(self) -> bool:
-        """Whether neither end was rendered without being confirmed."""
-        return not any(end.renders and not end.renders.confirmed for end in (self.max, self.min))
+        """Whether neither end is doubted."""
+        return not (self.max.doubted or self.min.doubted)
 
     def __post_init__(self) -> None:
         second = self.second.value if self.second else None

@@ -166,8 +166,7 @@ def _trace(trace: Trace | None) -> Entry:
 
 def _end(end: Eigenvalue) -> Entry:
     value, residual = end.value, end.residual
-    said = "not confirmed by renders" if end.renders and not end.renders.confirmed else ""
-    cell = Cell(measured(value, residual), said, end.reason or "")
+    cell = Cell(measured(value, residual), "not confirmed by renders" if end.doubted else "", end.reason or "")
     if value is None or residual is None:
         return Entry(value, cell)
     return Entry(value, cell, value - residual, value + residual)

@@ -197,11 +197,8 @@ class Gaussians(ShortRepr):
     def _is_moderate(self, largest: float) -> bool:
         """Whether no number is beyond `largest`, no quaternion below its inverse and no filter below 0."""
         low, high = torch.aminmax(self.flat.detach())
-        parts = [
-            low >= -largest,
-            high <= largest,
-            self.quats.detach().abs().amax(dim=1).amin() >= 1 / largest,
-        ]  # nan: False
+        least = self.quats.detach().abs().amax(dim=1).amin()
+        parts = [low >= -largest, high <= largest, least >= 1 / largest]  # False of nan
         if self.filter_widths is not None:
             parts += [self.filter_widths.amin() >= 0, self.filter_widths.amax() <= largest]
         return bool(torch.stack(parts).all())  # waits for a GPU once

@@ -41,8 +41,7 @@ def gsplat_hessian(
 
     rasterization: gsplat's, or `rasterization_2dgs`.  viewmats: world to camera.  images: in [0, 1], one for each camera.
     loss: by default that of its trainer, in float64, without its regularisers.  options: for rasterization, as sh_degree=2,
-    packed=True.  Quaternions stay as long as they are: curvature in one of length q is 1/q^2 of that at length 1, where
-    `landscape probe` measures.
+    packed=True.
 
     >>> from splat import Gaussians, SyntheticSettings, synthetic_scene
     >>> from splat.render.render import render
