@@ -1,11 +1,11 @@
-"""Sentences on a record: which attribute carries the curvature, its sign, how anisotropic, what was skipped.
+"""Sentences on a record: what failed, what is not known and what resolves it.  The numbers are in `tables`.
 
 Every sentence follows from numbers of the record and their errors alone; where an error does not decide, it says so.
 """
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeGuard
 
@@ -13,8 +13,8 @@ from msgspec import UNSET
 
 from analysis.records import schema
 from analysis.records.provenance import Provenance
-from analysis.records.quantities import UNDETERMINED, measured, quantity, rough, solved
-from analysis.records.records import Check, Counts, ProbeRecord, Skip
+from analysis.records.quantities import UNDETERMINED, quantity, rough, solved
+from analysis.records.records import Check, ProbeRecord
 
 ATTRIBUTES = {
     "means": "position",
@@ -46,30 +46,18 @@ def findings(data: ProbeRecord) -> list[Line]:
     ends = data.eigenvalues
     lines = [
         *of_checks(data.checks),
-        *_of_traces(data),
+        *_of_traces(data.traces),
         *_of_ends(data),
         *of_budgets({"max": ends.max.reason, "min": ends.min.reason}),
-        *_of_anisotropy(data),
         *_of_open(data),
-        *_of_needles(ends.max.lives_on, data.counts),
-        *_of_finite_probe(data.finite_probe),
-        *_of_depth(data.depth),
-        *_of_block_shares(data.block_shares or []),
-        *_of_counts(data.counts),
-        *_of_skips(data.skipped),
         *of_slice(data.slice, data.provenance),
         *(Line(_sentence(note), "caution") for note in data.notes),
     ]
     return sorted(lines, key=lambda line: line.level != "failure")
 
 
-def on_top(data: ProbeRecord) -> list[Line]:
-    """Sentences on what a summary says too."""
-    return [*of_checks(data.checks), *_of_traces(data), *_of_ends(data)]
-
-
 def of_checks(checks: Mapping[str, Check]) -> list[Line]:
-    """Lines on self-checks that failed or could not run, or that all passed."""
+    """Lines on self-checks that failed or could not run."""
     lines = []
     for name, check in checks.items():
         label, note = name.replace("_", " "), _in_brackets(check.note)
@@ -82,31 +70,20 @@ def of_checks(checks: Mapping[str, Check]) -> list[Line]:
                 lines.append(Line(f"{text} Its numbers are uncertain by as much.", "caution"))
             else:
                 lines.append(Line(f"{text} Do not trust its numbers.", "failure"))
-    if checks and all(check.passed for check in checks.values()):
-        lines.append(Line(f"All {len(checks)} checks passed."))
     return lines
 
 
-def trace_values(data: ProbeRecord) -> dict[str, float]:
-    """The finite traces, by attribute."""
-    return {name: trace.value for name, trace in data.traces.items() if _is_finite(trace.value)}
-
-
-def _of_traces(data: ProbeRecord) -> list[Line]:
-    traces, values = data.traces, trace_values(data)
+def _of_traces(traces: Mapping[str, schema.Trace]) -> list[Line]:
     lines = [
         Line(f"The trace of {attribute_name(name)} is {quantity(trace.value)}{_in_brackets(trace.note)}.", "failure")
         for name, trace in traces.items()
-        if name not in values
+        if not _is_finite(trace.value)
     ]
-    if any(values.values()):
-        steps = largest_steps(data)
-        lines.append(_of_largest_step(*steps) if steps else _of_largest_trace(traces, values))
-    elif values:
-        lines.append(Line("Every trace is exactly 0."))
     signs = {"negative": "negative: on average the loss curves down there", "undetermined": "not decided by its error"}
     for sign, words in signs.items():
-        if named := [attribute_name(name) for name in values if traces[name].sign == sign]:
+        if named := [
+            attribute_name(n) for n, trace in traces.items() if trace.sign == sign and _is_finite(trace.value)
+        ]:
             lines.append(Line(f"The sign of the trace of {' and '.join(named)} is {words}.", "caution"))
     return lines
 
@@ -134,54 +111,16 @@ def largest_steps(data: ProbeRecord) -> tuple[str, str, float] | None:
     return first, second, changes[0] / changes[1]
 
 
-def _of_largest_step(first: str, second: str, ratio: float) -> Line:
-    return Line(
-        f"By its curvature a random step in {attribute_name(first)}, as long as the optimiser's first, changes the loss "
-        f"{rough(ratio)} times as much as one in {attribute_name(second)}, the next."
-    )
-
-
-def _of_largest_trace(traces: Mapping[str, schema.Trace], values: Mapping[str, float]) -> Line:
-    """values: the finite traces, not all 0."""
-    first, *others = sorted(values, key=lambda name: -abs(values[name]))
-    share = abs(values[first]) / sum(map(abs, values.values()))
-    part = "most" if share > 0.5 else "the largest part"
-    text = (
-        f"{attribute_name(first).capitalize()} carries {part} of the curvature: its trace, "
-        f"{measured(values[first], traces[first].standard_error)}, is {share:.0%} of the sum of all absolute traces (each in "
-        "its own units)."
-    )
-    if near := [attribute_name(name) for name in others if not traces[first].exceeds(traces[name])]:
-        text += f" Its error does not separate it from {' and '.join(near)}."
-    return Line(text)
-
-
 def _of_ends(data: ProbeRecord) -> list[Line]:
-    ends, norm = data.eigenvalues, data.objective.gradient_norm
+    ends = data.eigenvalues
     numbers = [number for end in (ends.max, ends.min) for number in (end.value, end.residual) if _is_finite(number)]
     if len(numbers) < 4:
         return [Line("The extreme eigenvalues were not determined.", "failure")]
     top, top_error, bottom, bottom_error = numbers
-    where = f"over {data.counts.active_parameters:,} parameters"
-    where += f", with a gradient of norm {quantity(norm)}," if _is_finite(norm) else ""
-    text = f"{where} the curvature runs from {solved(bottom, bottom_error)} to {solved(top, top_error)}"
-    if bottom + bottom_error < 0 < top - top_error:
-        return [Line(f"{_of_negative(ends.min)}; {text}.")]
-    if bottom - bottom_error > 0:
-        return [Line(f"No direction of negative curvature was found: {text}.")]
-    if top + top_error < 0:
-        return [Line(f"No direction of positive curvature was found: {text}.")]
+    if bottom + bottom_error < 0 < top - top_error or bottom - bottom_error > 0 or top + top_error < 0:
+        return []
+    text = f"the curvature runs from {solved(bottom, bottom_error)} to {solved(top, top_error)}"
     return [Line(f"Whether the Hessian is indefinite is not decided by the residuals: {text}.", "caution")]
-
-
-def _of_negative(end: schema.Eigenvalue) -> str:
-    """What renders say of a negative eigenvalue."""
-    if end.renders and end.renders.confirmed:
-        return "The Hessian is indefinite, and renders confirm it, so the checkpoint is no basin in every direction"
-    said = "with no renders to compare"
-    if end.renders:
-        said = "but round-off hides it in renders" if end.renders.confirmed is None else "but renders do not confirm it"
-    return f"The Hessian is indefinite, {said}: no saddle is claimed"
 
 
 def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
@@ -192,21 +131,6 @@ def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
     text = "The search for the {} eigenvalue ended at its {}: the end may lie farther out."
     spent = {end: reason for end, reason in reasons.items() if reason and reason.endswith("budget")}
     return [Line(text.format(END_NAMES[end], reason), "caution") for end, reason in spent.items()]
-
-
-def _of_anisotropy(data: ProbeRecord) -> list[Line]:
-    """The ratio of both ends, unless renders refute one, and the part of the steepest direction."""
-    lines, share, ratio = [], data.indices.get("top_mass"), data.indices.get("negative_ratio")
-    text = "The steepest direction down is {} times as curved as the steepest up{}."
-    if ratio and _is_finite(ratio.value) and not is_loose(ratio) and ratio.value:
-        lines.append(Line(text.format(quantity(ratio.value), _bracket(ratio))))
-    elif ratio and ratio.high:
-        text = f"The ratio of the two ends of the spectrum is not determined{_in_brackets(ratio.note)}."
-        lines.append(Line(text, "caution"))
-    if share and _is_finite(share.value) and not is_loose(share):
-        text = f"The steepest direction alone holds {_percent(share.value)} of all absolute curvature"
-        lines.append(Line(f"{text}{_bracket(share, _percent)}."))
-    return lines
 
 
 def is_open(index: schema.Index) -> bool:
@@ -262,32 +186,6 @@ def _of_open(data: ProbeRecord) -> list[Line]:
     return lines
 
 
-def _of_needles(where: schema.Maybe[schema.LivesOn], counts: Counts) -> list[Line]:
-    """The paper's claim that Gaussians with an ill-conditioned projection dominate the steepest directions."""
-    if not where:
-        return []
-    count, share, spread = where.needle_count, where.needles, quantity(where.participation)
-    among = f"of {counts.visible_gaussians:,} Gaussians in sight"
-    if not count:
-        text = f"None {among} has a condition number above 100; the steepest direction is spread over about {spread}."
-        return [Line(text)]
-    has, holds = ("has", "holds") if count == 1 else ("have", "hold")
-    part = "under 1%" if 0 < share < 0.005 else f"{share:.0%}"
-    text = f"{count:,} {among} {has} a condition number above 100 and {holds} {part} of the steepest direction"
-    return [Line(f"{text}, which is spread over about {spread} Gaussians.")]
-
-
-def _of_finite_probe(probe: schema.FiniteProbe | None) -> list[Line]:
-    if probe is None:
-        return []
-    along, here = probe.direction or "the direction", quantity(probe.infinitesimal)
-    text = f"Along {along} the curvature is {here}; over finite steps it is "
-    if probe.best is not None:
-        error = math.hypot(probe.round_off[probe.best] or math.inf, probe.truncation[probe.best] or math.inf)
-        text += f"{measured(probe.curvatures[probe.best], error)} at ±{quantity(probe.steps[probe.best])} and "
-    return [Line(f"{text}{quantity(probe.curvatures[-1])} at ±{quantity(probe.steps[-1])}.")]
-
-
 def resolved(probe: schema.FiniteProbe) -> list[bool]:
     """Mask of the finite steps at which round-off does not hide the curvature."""
     here = abs(probe.infinitesimal or 0.0)
@@ -296,62 +194,6 @@ def resolved(probe: schema.FiniteProbe) -> list[bool]:
         value is not None and bound is not None and math.isfinite(value) and bound <= max(abs(value), here) / 2
         for value, bound in pairs
     ]
-
-
-def _of_depth(depth: schema.Depth | None) -> list[Line]:
-    """The paper's statement that the positions' gradient is typically 100 times as large along the rays as across them."""
-    if depth is None:
-        return []
-    lines, ratio = [], depth.curvature_ratio
-    if _is_finite(depth.gradient_ratio):
-        text = f"In depth, along the rays, the gradient of the positions is {quantity(depth.gradient_ratio)} times"
-        text += " what it is in a direction across them (root mean square; the paper says about 100)"
-        if _is_finite(ratio.value) and not is_loose(ratio):
-            text += f", and their curvature {quantity(ratio.value)} times{_bracket(ratio)}"
-        lines.append(Line(f"{text}."))
-    if rises := [row for row in depth.rises if _is_finite(row.ratio)]:
-        parts = [f"{measured(row.ratio, row.ratio_error)} at {row.pixels:g} px" for row in rises]
-        crossed = max(row.depth_crossed for row in rises)
-        text = "Steps along the rays raise the loss by this many times what steps as long across them do: "
-        text += f"{', '.join(parts)}. They changed the order of the splats in up to {crossed:.0%} of the renders"
-        lines.append(Line(f"{text}, which derivatives do not see."))
-    return lines
-
-
-def _of_block_shares(shares: Sequence[schema.BlockShare]) -> list[Line]:
-    """How much of an operator its block-diagonal and diagonal approximations keep: shares of its squared entries."""
-    names, parts = {"hessian": "the Hessian", "gauss-newton": "Gauss-Newton"}, []
-    for one in shares:
-        if one.blocks is not None and one.diagonal is not None:
-            operator = names[one.operator] + ("" if one.ssim_window else " without SSIM's window")
-            share = measured(100 * one.blocks, 100 * one.blocks * one.relative_error)
-            parts.append(f"of {operator} {share}% ({one.diagonal:.0%} on the diagonal)")
-    text = "Of the sum of all squared entries, this lies within the Gaussians' own blocks (11 x 11, and the diagonal of SH): "
-    return [Line(f"{text}{', '.join(parts)}.")] if parts else []
-
-
-def _of_skips(skipped: Mapping[str, Skip]) -> list[Line]:
-    """Work left out, the largest saving first."""
-    parts = []
-    for name, skip in sorted(skipped.items(), key=lambda item: -(item[1].seconds_saved or 0.0)):
-        if skip.count:
-            saved = "" if skip.seconds_saved is None else f" ({rough(skip.seconds_saved)} s)"
-            parts.append(f"{skip.count:,} {name.replace('_', ' ').replace('gaussian', 'Gaussian')}{saved}")
-    return [Line(f"Left out, with the time it saved where that is known: {', '.join(parts)}.")] if parts else []
-
-
-def _of_counts(counts: Counts) -> list[Line]:
-    lines = []
-    if unseen := counts.gaussians - counts.visible_gaussians:
-        text = f"{unseen:,} of {counts.gaussians:,} Gaussians touch no pixel of any view and were left out."
-        lines.append(Line(text))
-    if counts.sh_degree_active < counts.sh_degree_stored:
-        degrees = f"degree {counts.sh_degree_active} of {counts.sh_degree_stored}"
-        text = f"Colour uses spherical harmonics of {degrees}; the bands above were left out."
-        lines.append(Line(text))
-    used = f"{counts.active_parameters:,} of {counts.parameters:,} parameters"
-    views = f"{counts.views} of {counts.views_of}" if counts.views_of else f"{counts.views}"
-    return [*lines, Line(f"The operator acts on {used}, over {views} views.")]
 
 
 def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
@@ -402,13 +244,13 @@ def _is_finite(number: schema.Number) -> TypeGuard[float]:
     return number is not None and math.isfinite(number)
 
 
-def _bracket(index: schema.Index, written: Callable[[float], str] | None = None) -> str:
-    """Its bracket in words; none where its ends look alike.  written: formats an end."""
+def _bracket(index: schema.Index) -> str:
+    """Its bracket in words; none where its ends look alike."""
     ends = index.low, index.high
-    texts = [UNDETERMINED if end is None else (written or quantity)(end) for end in ends]
     if None not in ends:
-        return f" (between {texts[0]} and {texts[1]})" if texts[0] != texts[1] else ""
-    known = [f" (at {words} {text})" for words, end, text in zip(("least", "most"), ends, texts, strict=True) if end]
+        low, high = map(quantity, ends)
+        return f" (between {low} and {high})" if low != high else ""
+    known = [f" (at {words} {quantity(end)})" for words, end in zip(("least", "most"), ends, strict=True) if end]
     return known[0] if known else ""
 
 

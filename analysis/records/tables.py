@@ -1,5 +1,6 @@
 """Tables of a probe's record: all numbers, for the terminal; the anisotropy families, for the terminal and the report."""
 
+import math
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -10,10 +11,10 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from analysis.records.findings import attribute_name, is_open, is_wide
-from analysis.records.quantities import HARD, PLUS_MINUS, UNDETERMINED, apart, limits, measured, quantity
+from analysis.records.findings import attribute_name, is_open, is_wide, resolved
+from analysis.records.quantities import HARD, PLUS_MINUS, UNDETERMINED, apart, limits, measured, percent, quantity
 from analysis.records.records import Check, Counts, ProbeRecord
-from analysis.records.schema import INDICES, BlockAnisotropy, BlockShare, Depth, Effect, End, Index, Number
+from analysis.records.schema import INDICES, BlockAnisotropy, BlockShare, Depth, Effect, End, FiniteProbe, Index, Number
 
 ENDS = {
     "max": "largest eigenvalue",
@@ -26,32 +27,43 @@ NEEDS_DENSITY = "needs the spectral density, which was left out"  # note of an i
 OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
 ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
+LEAST = 0.005  # share of an attribute in an eigenvector that is told
 GAPS, NUMBER, REMARK = 8, 27, 22  # of the probe's table: between columns, widest number in a line, least room for words
 WIDTH = 15  # of a column of the families' table, with which it fits into 80
 NARROW = 0.1  # width of a bracket, over the value, below which it is written as an error
 Row = tuple[str, str, str]
 
 
+def number_rows(data: ProbeRecord) -> dict[str, list[Row]]:
+    """Rows of all numbers, by section: name, value ± error, what else is known."""
+    sections = {
+        "Curvature by attribute": _trace_rows(data),
+        "Extreme eigenvalues": _end_rows(data),
+        "Anisotropy": _index_rows(data),
+        "Finite steps along e₁": _finite_rows(data.finite_probe),
+        "Positions along and across the rays": _depth_rows(data.depth),
+        "Shares within blocks": _share_rows(data.block_shares or []),
+        "Sizes": _count_rows(data.counts),
+        "Checks": _check_rows(data.checks),
+    }
+    return {name: known for name, rows in sections.items() if (known := list(rows))}
+
+
 def probe_table(data: ProbeRecord, width: int = 80) -> Table:
-    """Traces, eigenvalues, anisotropy, counts and checks.  Words are wrapped to the width, numbers are not."""
-    sections = (
-        _trace_rows(data), _end_rows(data), _index_rows(data), _depth_rows(data.depth), _share_rows(data.block_shares or []),
-        _count_rows(data.counts), _check_rows(data.checks),
-    )  # fmt: skip
-    rows = [row for section in sections for row in (*section, None)][:-1]
-    rows = [row and (row[0], _folded(row[1], NUMBER), row[2]) for row in rows]
-    name, value = (max(len(line) for row in rows if row for line in row[i].splitlines()) for i in (0, 1))
+    """All numbers.  Words are wrapped to the width, numbers are not."""
+    sections = [[(r[0], _folded(r[1], NUMBER), r[2]) for r in rows] for rows in number_rows(data).values()]
+    cells = [row for rows in sections for row in rows]
+    name, value = (max(len(line) for row in cells for line in row[i].splitlines()) for i in (0, 1))
     name = min(name, max(width - value - GAPS - REMARK, REMARK))
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=ERRORS, caption_justify="left")
     table.add_column("", no_wrap=True)
     table.add_column("value ± error", justify="right", no_wrap=True)
     table.add_column("", no_wrap=True)
-    for row in rows:
-        if row:
-            cells = wrapped(row[0], name), row[1], wrapped(row[2], width - name - value - GAPS)
-            table.add_row(*map(escape, cells))
-        else:
-            table.add_section()
+    for rows in sections:
+        for row in rows:
+            shown = wrapped(row[0], name), row[1], wrapped(row[2], width - name - value - GAPS)
+            table.add_row(*map(escape, shown))
+        table.add_section()
     return table
 
 
@@ -70,8 +82,8 @@ def wrapped(text: str, width: int) -> str:
 def _trace_rows(data: ProbeRecord) -> Iterator[Row]:
     for name, trace in data.traces.items():
         about = (
-            f"τ {quantity(trace.tau)}, {trace.sign}, dim {trace.dim:,}, {trace.matvecs} products"
-            f"{_reason(trace.reason)}{_of_views(trace.views_error)}"
+            f"{limits(trace.low, trace.high)}, {trace.sign}, τ {quantity(trace.tau)}, dim {trace.dim:,}, {trace.method}, "
+            f"{trace.probes} samples{_reason(trace.reason)}{_of_views(trace.views_error)}"
         )
         yield f"trace of {attribute_name(name)}", measured(trace.value, trace.standard_error), about
 
@@ -79,13 +91,20 @@ def _trace_rows(data: ProbeRecord) -> Iterator[Row]:
 def _end_rows(data: ProbeRecord) -> Iterator[Row]:
     """Rows of the eigenvalues; one whose search ended at a budget has its value among the words."""
     for name, end in data.eigenvalues.items():
-        main, share = max(end.shares.items(), key=lambda item: item[1], default=("no attribute", 0.0))
-        value = measured(end.value, end.residual)
-        about = f"{share:.0%} {attribute_name(main)}, {end.matvecs} products"
-        about += f"{_reason(end.reason)}{_of_views(end.views_error)}"
+        shares = ", ".join(f"{share:.0%} {attribute_name(of)}" for of, share in end.shares.items() if share >= LEAST)
+        value, made = measured(end.value, end.residual), f"{end.matvecs} products" if end.matvecs else ""
+        about = (
+            f"{', '.join(filter(None, (shares, end.method, made)))}{_reason(end.reason)}{_of_views(end.views_error)}"
+        )
         if not end.is_reached:
             value, about = UNDETERMINED, f"at {value} so far; {about}"
         yield ENDS[name], value, about
+    if where := data.eigenvalues.max.lives_on:
+        among = (
+            f"{where.needle_count:,} of {data.counts.visible_gaussians:,} Gaussians in sight, of the steepest direction"
+        )
+        yield "share on needles", percent(where.needles), among
+        yield "Gaussians it is spread over", quantity(where.participation), ""
 
 
 def _index_rows(data: ProbeRecord) -> Iterator[Row]:
@@ -102,18 +121,24 @@ def _count_rows(counts: Counts) -> Iterator[Row]:
 
 
 def _check_rows(checks: Mapping[str, Check]) -> Iterator[Row]:
-    """Rows of the checks; those that passed in one."""
-    if good := [name.replace("_", " ") for name, check in checks.items() if check.passed]:
-        yield "checks passed", f"{len(good)} of {len(checks)}", ", ".join(good)
     for name, check in checks.items():
-        if not check.passed:
-            outcome = "could not run" if check.passed is None else "FAILED"
-            note = f" ({check.note})" if check.note else ""
-            yield (
-                f"check: {name.replace('_', ' ')}",
-                quantity(check.value),
-                f"{outcome}, at most {quantity(check.bound)}{note}",
-            )
+        outcome = {None: "could not run", True: "passed", False: "FAILED"}[check.passed]
+        note = f" ({check.note})" if check.note else ""
+        yield (
+            f"check: {name.replace('_', ' ')}",
+            quantity(check.value),
+            f"{outcome}, at most {quantity(check.bound)}{note}",
+        )
+
+
+def _finite_rows(probe: FiniteProbe | None) -> Iterator[Row]:
+    """Rows of the second differences, at the steps where round-off does not hide them."""
+    if probe is not None:
+        columns = probe.steps, probe.curvatures, probe.round_off, probe.truncation, resolved(probe)
+        for step, value, rounded, truncated, sure in zip(*columns, strict=True):
+            if sure:
+                error = math.hypot(*(math.inf if each is None else each for each in (rounded, truncated)))
+                yield f"curvature at ±{quantity(step)}", measured(value, error), ""
 
 
 def _reason(reason: str | None) -> str:
@@ -133,8 +158,13 @@ def _depth_rows(depth: Depth | None) -> Iterator[Row]:
     median = f"median {quantity(depth.gradient_median)}, {depth.pairs:,} pairs of Gaussian and view"
     yield "depth gradient / lateral", quantity(depth.gradient_ratio), median
     yield "depth curvature / lateral", *_index(depth.curvature_ratio)
+    for kind, trace in depth.curvature.items():
+        yield f"trace of curvature, {kind}", measured(trace.value, trace.standard_error), f"dim {trace.dim:,}"
     for row in depth.rises:
-        rises = f"{measured(row.depth, row.depth_error)} over {measured(row.lateral, row.lateral_error)}"
+        rises = (
+            f"{measured(row.depth, row.depth_error)} over {measured(row.lateral, row.lateral_error)}; order changed in "
+        )
+        rises += f"{row.depth_crossed:.0%} and {row.lateral_crossed:.0%} of the renders"
         yield f"depth / lateral rise, {row.pixels:g} px", measured(row.ratio, row.ratio_error), rises
 
 

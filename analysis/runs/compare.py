@@ -157,7 +157,7 @@ def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
     for run in runs:
         if run.data.slice and not run.data.slice.is_resolved:
             said.append((run, unresolved(run.data.slice, run.data.provenance)))
-        said += [(run, line.text) for line in of_checks(run.data.checks) if line.level != "fact"]
+        said += [(run, line.text) for line in of_checks(run.data.checks)]
         ends = {"max": run.data.eigenvalues.max.reason, "min": run.data.eigenvalues.min.reason}
         said += [(run, line.text) for line in of_budgets(ends)]
         said += [(run, "It was not scored.")] * (run.scores is None)

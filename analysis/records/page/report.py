@@ -20,15 +20,15 @@ import jinja2
 import numpy as np
 from PIL import Image
 
-from analysis.records.findings import Line, attribute_name, findings, is_loose, on_top, shares_per_trace
+from analysis.records.findings import Line, attribute_name, findings, shares_per_trace
 from analysis.records.json_files import plain
 from analysis.records.page.summary import told
 from analysis.records.provenance import Provenance
-from analysis.records.quantities import exponent_of, limits, measured, percent, quantity, ratio, unit_suffix
+from analysis.records.quantities import exponent_of, percent, quantity, ratio, unit_suffix
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map, read_maps
 from analysis.records.schema import INDICES
-from analysis.records.tables import family_lines
+from analysis.records.tables import family_lines, number_rows
 from figures.eye import eye_over
 from landscape.errors import InputError
 from splat.model.untrusted import read_picture, write_atomically
@@ -77,13 +77,9 @@ def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environ
     )
     environment.filters |= {
         "quantity": quantity,
-        "limits": limits,
-        "measured": measured,
-        "attribute": attribute_name,
         "cell": _cell,
         "setting": _setting,
         "capitalise": lambda words: words[:1].upper() + words[1:],
-        "loose": is_loose,
     }
     return environment
 
@@ -115,13 +111,13 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
     template = template_environment().get_template("report.html.jinja")
     return template.render(
         data=data,
-        counts=plain(data.counts),
+        counts=plain(data.counts) | {"left out": plain(data.skipped)},
         provenance=_told(data.provenance),
         subtitle=subtitle(data),
         lines=lines,
         place=place_of(record, views) if "steepest" in lines else None,
         findings=said,
-        facts=[line for line in said if line.level == "fact" and line not in on_top(data)],
+        numbers=number_rows(data),
         views=views,
         listed_views=listed,
         start=start,

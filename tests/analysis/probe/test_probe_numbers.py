@@ -10,9 +10,8 @@ from rich.console import Console
 
 from analysis.measures.depth import STEPS, depth_split
 from analysis.probe.record import paper_index
-from analysis.records.findings import findings
 from analysis.records.quantities import measured
-from analysis.records.tables import probe_table
+from analysis.records.tables import number_rows, probe_table
 from landscape import DenseOperator, EigenSettings, PowerSettings, extreme_eigenpairs, power_ends
 from splat.curvature.hessian import SceneHessian
 from tests.recorded import soft
@@ -172,5 +171,5 @@ def test_the_share_within_gaussians_blocks_is_that_of_the_dense_hessian(record, 
         inside[own[:, None], own] = True
     share = float(H[inside].square().sum() / H.square().sum())
     assert abs(found[0].blocks - share) < 5 * share * found[0].relative_error and found[0].relative_error < 0.1
-    said = " ".join(line.text for line in findings(record.data))
-    assert f"of the Hessian {measured(100 * found[0].blocks, 100 * found[0].blocks * found[0].relative_error)}%" in said
+    rows = number_rows(record.data)["Shares within blocks"]
+    assert rows[0][:2] == ("in blocks: Hessian", measured(found[0].blocks, found[0].blocks * found[0].relative_error))
