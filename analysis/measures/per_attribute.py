@@ -8,14 +8,12 @@ A family is both ends of the spectrum, the density and the indices (`landscape.s
     block       "all", or an attribute: that diagonal block of the operator
 
 The effect of the split is an index of the split scene over that of the trained one: what the number of Gaussians alone changes.
-Every family stops at its tolerance, its budget of products, or its share of the time, in proportion to the scene's Gaussians.
+Every family stops at its tolerance or its budget of products.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from math import inf
-from time import monotonic
 from typing import Literal
 
 import numpy as np
@@ -33,7 +31,6 @@ from analysis.records.records import ProbeRecord
 from landscape import BlockAnisotropy, BlockAnisotropySettings, Bracket, ScaledOperator, block_anisotropies
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
-from landscape.operators.operator import SymmetricOperator, finished
 from landscape.probes import spawn
 from landscape.results import Progress, finite_or_none
 from landscape.spectrum.block_anisotropy import WHOLE, WarmStart
@@ -48,31 +45,19 @@ from splat.training.state import Training
 SceneName = Literal["trained", "split"]
 OPERATORS: dict[schema.Operator, bool] = {"hessian": False, "gauss-newton": True}  # name -> gauss_newton
 PARTS = 6  # the whole and five attributes
-FEWEST_STEPS = 2  # that make a density
 TRACE_SAMPLES = 8  # of SSIM's coupling: to a few percent, less than the error from the density's start vectors
 PRODUCTS = 26.0  # expected of a family, with a batch of vectors
 SPLIT = 1.5  # factor of their cost in the split scene
-DENSITY_SHARE = 0.45  # of a family's time, as by default 48 of its 108 products
 
 
 @dataclass(frozen=True)
 class PerAttributeOptions:
-    """Metric, split control and budget of the families.
-
-    family: budget of each; seconds: for all of them together; memory: GiB for the vectors of a basis.
-    """
+    """Metric, split control and budget of the families.  family: of each; memory: GiB for the vectors of a basis."""
 
     metric: Metric = "parameters"
     split_control: bool = False
     family: BlockAnisotropySettings = field(default_factory=BlockAnisotropySettings)
-    seconds: float = inf
     memory: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not (self.seconds > 0 and self.memory > 0):
-            raise InputError(
-                f"expected seconds and memory above 0 for --per-attribute, got {self.seconds} and {self.memory}"
-            )
 
     @property
     def products(self) -> float:
@@ -169,7 +154,6 @@ def measure_per_attribute(
                 objective.active, [view.camera for view in objective.views], objective.background, objective.settings
             )
             scenes["split"] = _with(objective, control)
-    clock = _Clock(options.seconds, {name: len(scene.active) for name, scene in scenes.items()})
     unit, scale = _metric(options.metric, objective, training)
     streams: dict[tuple[SceneName, schema.Operator], torch.Generator] = {
         (scene, operator): spawn(generator)
@@ -182,7 +166,7 @@ def measure_per_attribute(
             hessian = SceneHessian(scenes[scene], gauss_newton=OPERATORS[operator])
             D = scale(scenes[scene])
             known = ends if scene == "trained" and operator == "hessian" and D is None else None
-            measured = _of_operator(hessian, D, known, options, stream, partial(clock.share, scene), report, notes)
+            measured = _of_operator(hessian, D, known, options, stream, report, notes)
             count = len(scenes[scene].active)
             rows += [FamilyRow(scene, operator, block, count, dim, found) for block, dim, found in measured]
     return FamilyFindings(tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)), options.metric, unit)
@@ -192,20 +176,6 @@ def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:
     """Objective of the split Gaussians: the same loss over the same views."""
     settings = objective.loss_of_active, objective.background, objective.settings
     return SceneObjective(control.gaussians, objective.views, *settings)
-
-
-class _Clock:
-    """Divides the time left among the remaining families, in proportion to the Gaussians of their scene."""
-
-    def __init__(self, seconds: float, gaussians: Mapping[SceneName, int]) -> None:
-        self.end, self.gaussians = monotonic() + seconds, dict(gaussians)
-        self.remaining: dict[SceneName, int] = {name: PARTS * len(OPERATORS) for name in gaussians}
-
-    def share(self, scene: SceneName) -> float:
-        """Seconds of the next family, which is one of this scene."""
-        part = self.gaussians[scene] / sum(count * self.gaussians[name] for name, count in self.remaining.items())
-        self.remaining[scene] -= 1
-        return max(self.end - monotonic(), 0.0) * part
 
 
 def _metric(
@@ -237,25 +207,22 @@ def _of_operator(
     ends: EigenEnds | None,
     options: PerAttributeOptions,
     generator: torch.Generator,
-    seconds: Callable[[], float],
     report: Progress,
     notes: list[str],
 ) -> list[tuple[str, int, BlockAnisotropy]]:
     """(block, dim, family) of the whole and of every attribute of one operator.
 
-    ends: of the whole, where known.  seconds: the time of the next family.  notes: gets sentences on what was left out.
+    ends: of the whole, where known.  notes: gets sentences on what was left out.
     """
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
     spaces, found = active_spaces(hessian.objective, hessian.projector, scale), []
     traces = _traces(hessian, scale, spawn(generator))
-    product = _seconds_a_product(operator, options.family.batch, hessian.objective) if options.seconds < inf else 0.0
-    names = [WHOLE, *hessian.blocks]
+    names, settings = [WHOLE, *hessian.blocks], _fitted(hessian.objective, options, notes)
     for done, name in enumerate(names):
-        stream, allowed = spawn(generator), seconds()
+        stream = spawn(generator)
         if name != WHOLE and name not in spaces:  # an attribute of rank 0
             continue
         report(done, len(names), name)
-        settings = _fitted(hessian.objective, options, allowed, product, notes)
 
         def say(_: int, __: int, state: str, done: int = done) -> None:
             report(done, len(names), state)
@@ -296,34 +263,16 @@ def _start(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEn
     return known.steepest(1, 0) if hessian.gauss_newton or name == "means" else known.warm_start()
 
 
-def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: SceneObjective) -> float:
-    """Seconds of a product with `batch` vectors; the second counts, as kernels may compile in the first."""
-    V, start = objective.active.flat.new_ones(operator.dim, batch), 0.0
-    for _ in range(2):
-        start = monotonic()
-        finished(operator.apply(V))
-    return monotonic() - start
-
-
-def _fitted(
-    objective: SceneObjective, options: PerAttributeOptions, seconds: float, product: float, notes: list[str]
-) -> BlockAnisotropySettings:
-    """The budget of a family that is given so many seconds: basis and batch fit into memory, both searches into the time.
-
-    product: seconds of a product with a batch of vectors.  notes: gets sentences on what was cut down.
-    """
+def _fitted(objective: SceneObjective, options: PerAttributeOptions, notes: list[str]) -> BlockAnisotropySettings:
+    """The budget of a family: basis and batch fit into memory.  notes: gets sentences on what was cut down."""
     settings, room = options.family, vectors_within(objective, options.memory)
-    eigen, steps = settings.eigen, settings.steps
-    basis = basis_within(eigen, room)
-    if basis < eigen.basis:
-        notes.append(f"the families' Lanczos kept {basis} vectors instead of {eigen.basis}, to stay within memory")
-    batch = max(1, min(settings.batch, room // steps))  # a run of the density keeps a vector a step
-    seconds_a_step = -(-settings.starts // batch) * product
-    if steps * seconds_a_step > DENSITY_SHARE * seconds:
-        steps = min(steps, max(FEWEST_STEPS, int(DENSITY_SHARE * seconds / seconds_a_step)))
-        notes.append("some densities of the families took fewer steps than asked for, to stay within the time")
-    eigen = replace(eigen, basis=basis, max_seconds=min(eigen.max_seconds, (1 - DENSITY_SHARE) * seconds))
-    return replace(settings, eigen=eigen, batch=batch, steps=steps)
+    basis = basis_within(settings.eigen, room)
+    if basis < settings.eigen.basis:
+        notes.append(
+            f"the families' Lanczos kept {basis} vectors instead of {settings.eigen.basis}, to stay within memory"
+        )
+    batch = max(1, min(settings.batch, room // settings.steps))  # a run of the density keeps a vector a step
+    return replace(settings, eigen=replace(settings.eigen, basis=basis), batch=batch)
 
 
 def _effects(rows: list[FamilyRow]) -> tuple[schema.Effect, ...]:

@@ -199,7 +199,7 @@ def _family_options(options: ProbeOptions) -> "PerAttributeOptions | None":
         return None
     from analysis.measures.per_attribute import PerAttributeOptions  # slow to import
 
-    return PerAttributeOptions(options.metric, options.split_control, seconds=options.per_attribute_seconds)
+    return PerAttributeOptions(options.metric, options.split_control)
 
 
 def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjective) -> str:

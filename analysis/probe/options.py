@@ -45,14 +45,13 @@ class ProbeOptions:
     slice_rise: float = 0.001
     """A curvature unit changes the loss by this share of it; the slice reaches 3 each way."""
     per_attribute: bool = False
-    """Also anisotropy of all attributes and of each, by four times as many products as the rest.  Not under torchrun."""
+    """Also anisotropy of all attributes and of each, by four times as many products as the rest, which --seconds
+    does not end.  Not under torchrun."""
     split_control: bool = False
     """The same, and of the scene with every Gaussian split in two: what their number alone does.  2.5 times as long."""
     metric: Annotated[Literal["parameters", "scene", "optimiser"], arg(metavar="NAME")] = "parameters"
     """Units of --per-attribute, which it implies.
     parameters: as stored.  scene: positions in units of the scene's size.
     optimiser: in units of the first step's learning rates."""
-    per_attribute_seconds: float = 1800.0
-    """Time for --per-attribute beside --seconds.  inf: no limit."""
     memory: MostMemory = None
     foreign: OtherTools = field(default_factory=Foreign)

@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from dataclasses import astuple, replace
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,26 +15,13 @@ from rich.console import Console
 from scipy.stats import binom
 
 from analysis.commands.cli import main
-from analysis.measures.per_attribute import (
-    FamilyFindings,
-    PerAttributeOptions,
-    _seconds_a_product,
-    measure_per_attribute,
-    quotient,
-)
+from analysis.measures.per_attribute import FamilyFindings, PerAttributeOptions, measure_per_attribute, quotient
 from analysis.measures.split_control import split_in_two
 from analysis.records.page.report import render_report
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.schema import INDICES, End, Index
 from analysis.records.tables import Cell, family_lines, family_table
-from landscape import (
-    BlockAnisotropySettings,
-    Bracket,
-    DenseOperator,
-    EigenSettings,
-    block_anisotropies,
-    extreme_eigenpairs,
-)
+from landscape import BlockAnisotropySettings, Bracket, EigenSettings, block_anisotropies, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
@@ -51,7 +37,7 @@ from tests.recorded import soft
 SCENE = SyntheticSettings(gaussians=50, views=4, width=16, height=12)
 BUDGET = BlockAnisotropySettings(EigenSettings(rtol=1e-2, max_matvecs=40), starts=3, steps=6)
 BLOCKS = ["all", "means", "log_scales", "quats", "opacity_logits", "sh"]
-QUICK = ["--quick", "--seconds", "inf", "--slice-points", "5", "--per-attribute-seconds", "inf"]
+QUICK = ["--quick", "--seconds", "inf", "--slice-points", "5"]
 
 
 @pytest.fixture(scope="module")
@@ -349,34 +335,9 @@ def same(a: torch.Tensor | None, b: torch.Tensor) -> bool:
     return a is not None and a.shape == b.shape and torch.equal(a, b)
 
 
-def test_a_product_is_timed_where_the_scene_is():
-    there, placed = SimpleNamespace(active=SimpleNamespace(flat=torch.empty(0, device="meta"))), []
-
-    class Identity(DenseOperator):
-        def apply(self, V):
-            placed.append((V.device.type, *V.shape))
-            return V
-
-    _seconds_a_product(Identity(torch.eye(3)), 2, there)  # pyright: ignore[reportArgumentType]
-    assert placed == [("meta", 3, 2)] * 2
-
-
-def test_time_that_runs_out_is_said(objective, checkpoint):
-    short = found(objective, checkpoint, seconds=1e-6)
-    assert all(row.family.ends.largest.reason == "time budget" for row in short.rows if row.block == "all")
-    assert {row.family.density.nodes.shape[1] for row in short.rows} == {2}
-    assert any("fewer steps" in note for note in short.notes)
-
-
 def test_memory_bounds_the_vectors_that_are_kept(objective, checkpoint):
     small = found(objective, checkpoint, memory=10 * objective.active.flat.numel() * 8 / 2**30)
     assert any("Lanczos kept 10 vectors instead of 64" in note for note in small.notes)
-
-
-def test_a_time_that_is_none_is_refused(path, tmp_path, capsys):
-    words = ["probe", str(path), "--out", str(tmp_path / "probe"), "--metric", "scene", "--per-attribute-seconds", "0"]
-    assert main(words) == 2
-    assert "above 0 for --per-attribute" in capsys.readouterr().err and list(tmp_path.iterdir()) == []
 
 
 class Tables(HTMLParser):

@@ -62,7 +62,7 @@ def test_a_renderer_is_probed_as_a_scene_is(file, capsys):
         ("broken", [], "got ZeroDivisionError: division by zero"),
         ("absent", [], "got AttributeError"),
         ("make", ["--per-attribute"], "expected of a renderer no --per-attribute"),
-        ("make", ["--per-attribute-seconds", "5"], "expected of a renderer no --per-attribute-seconds"),
+        ("make", ["--split-control"], "expected of a renderer no --split-control"),
     ],
 )
 def test_a_factory_that_cannot_be_used_is_refused(file, capsys, name, options, words):

@@ -310,7 +310,7 @@ def test_two_sweeps_share_the_cells_and_the_last_writes_all(folder, tmp_path, mo
 
 
 def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, folder):
-    controlled = "[probe]\nsplit_control = true\nper_attribute_seconds = 7"
+    controlled = "[probe]\nsplit_control = true"
     with_probe = read_sweep(finished.file, probe=True)
     control = read_sweep(written(folder, "[scenes.still]", f"{controlled}\n[scenes.still]"))
     cell = with_probe.cells[0]
@@ -320,14 +320,12 @@ def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, fold
     recorded.written(cell.out / "probe", data, arrays)
     try:
         assert missing(cell, with_probe) == [] and missing(cell, control) == ["probe"]
-        assert probe_arguments(cell, control)[4:] == ["--split-control", "--per-attribute-seconds", "7.0"]
+        assert probe_arguments(cell, control)[4:] == ["--split-control"]
         row = results([cell], {cell.name: "done"}).iloc[0]
         assert row["trace_means"] == data["traces"]["means"]["value"] and row["lambda_min_error"] == 3.0
         assert (row["negative_ratio_low"], row["negative_ratio_high"]) == (1 / 143.0, 1 / 139.0)
         assert row["top_mass"] is None
-        data["provenance"] |= recorded.own(
-            cell.out, split_control=True, per_attribute_seconds=7.0
-        )  # more than was asked for
+        data["provenance"] |= recorded.own(cell.out, split_control=True)  # more than was asked for
         recorded.written(cell.out / "probe", data, arrays)
         assert missing(cell, with_probe) == missing(cell, control) == []
         for other in ({"loss": "3dgs", "seed": 1}, {"quick": True}):
