@@ -224,11 +224,9 @@ def _errors_of_interpolation(plane: schema.Slice) -> str:
 
 def unresolved(plane: schema.Slice, made: Provenance) -> str:
     """Why a plane is not drawn, and the command that resolves it."""
-    limited = "--max-renders" in (made.command or "")
-    resolving = "leave out --max-renders" if limited else f"landscape slice {made.checkpoint} renders more"
     return (
         f"Between its two sections the plane is not known{_to_tolerance(plane)} from {plane.evaluated_points:,} of "
-        f"{plane.points:,} renders, and no surface is drawn; {resolving}."
+        f"{plane.points:,} renders, and no surface is drawn; landscape slice {made.checkpoint} renders more."
     )
 
 

@@ -14,7 +14,6 @@ import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
-from math import inf
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -66,7 +65,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
     require_seed(options.seed)
     shape = Shape.of(options.along, options.dimension, options.radius, options.points, len(options.others))
     device = device_named(options.device)
-    settings = _settings(options, shape, device)
+    settings = _settings(options, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
     unfinished, console, start = out.with_name(f".{out.name}.unfinished"), Console(stderr=True), perf_counter()
     require_replaceable(out, SliceRecord.FILE)
@@ -107,22 +106,10 @@ def _asked(options: SliceOptions, settings: SliceSettings) -> dict[str, Any]:
     return amounts | {name: getattr(options, name) for name in ("along", "dimension", "radius", "points")}
 
 
-def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
-    """Settings of the slice; by default a thread for each render on a CPU, one render at a time on a GPU."""
-    most = torch.get_num_threads() if device.type == "cpu" else 1
-    workers = most if options.workers is None else options.workers
-    if options.all_points:
-        if options.max_renders is not None:
-            raise InputError("expected --all-points or --max-renders, got both; leave one out")
-        return SliceSettings(tolerance=None, workers=workers)
-    least = options.points * shape.dimension + 1
-    if options.max_renders is not None and options.max_renders < least:
-        raise InputError(
-            f"expected --max-renders of at least {least}, the points of the axes, which are all rendered, and the centre, got "
-            f"{options.max_renders}; take fewer --points"
-        )
-    renders = inf if options.max_renders is None else options.max_renders
-    return SliceSettings(options.tolerance, workers=workers, max_evaluations=renders)
+def _settings(options: SliceOptions, device: torch.device) -> SliceSettings:
+    """Settings of the slice: a thread for each render on a CPU, one render at a time on a GPU."""
+    tolerance = None if options.all_points else options.tolerance
+    return SliceSettings(tolerance, workers=torch.get_num_threads() if device.type == "cpu" else 1)
 
 
 def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:

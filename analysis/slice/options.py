@@ -39,14 +39,9 @@ class SliceOptions:
     points: int = 41
     """Points along each direction, odd; a line to OTHER may get a few more or less."""
     tolerance: float = 0.01
-    """Error of the points of a plane that are not rendered, as a share of the range of the loss.
-    Where too few renders are made to reach it, no surface is drawn."""
+    """Error of the points of a plane that are not rendered, as a share of the range of the loss."""
     all_points: bool = False
     """Render every point, whatever the tolerance."""
-    max_renders: int | None = None
-    """Points that are rendered at most, with those before an interruption.  Default: no limit."""
-    workers: int | None = None
-    """Points rendered at a time.  Default: one for each processor; one on a GPU."""
     device: Device = "auto"
     seed: int = 0
     """Seed of random directions, Lanczos's start, and the points that judge the interpolation."""

@@ -52,9 +52,8 @@ class GridEvaluations:
     """The objective at center + directions @ points[i].  `require` makes points known.
 
     value, known, discontinuous [points]: the loss (nan where not known), whether it is known, and whether the point lies on
-    another smooth piece than the centre.  has_pieces: whether the objective names its pieces.  made: number of points that were
-    evaluated, not read.  If workers > 1, loss must be safe to call from several threads.  Points are computed in float64 on the
-    device of center, and rounded once to its dtype.
+    another smooth piece than the centre.  has_pieces: whether the objective names its pieces.  If workers > 1, loss must be
+    safe to call from several threads.  Points are computed in float64 on the device of center, and rounded once to its dtype.
     """
 
     def __init__(
@@ -74,7 +73,7 @@ class GridEvaluations:
         if not isfinite(self.center_loss):
             raise InputError(f"expected a finite objective at the centre, got {self.center_loss}")
         self.has_pieces = self._here is not None
-        self.value, self.made = np.full(len(points), np.nan), 0
+        self.value = np.full(len(points), np.nan)
         self.known, self.discontinuous = np.zeros((2, len(points)), bool)
         self._digest = slice_digest(self._center, self._spans, points)
         self._stored = self._read(store) if store is not None else {}
@@ -90,7 +89,6 @@ class GridEvaluations:
         try:
             for point, (value, piece) in zip(missing, self._evaluate(missing), strict=True):
                 self._stored[point] = value, piece != self._here
-                self.made += 1
                 self._set(point, *self._stored[point])
                 if self._store is not None and monotonic() - saved > SAVE_EVERY:
                     self._write(self._store)

@@ -14,7 +14,6 @@ hold-out, so that the result does not depend on the number of workers.
 
 from dataclasses import dataclass
 from math import inf
-from time import monotonic
 
 import numpy as np
 import torch
@@ -35,27 +34,23 @@ class SliceSettings:
     holdout: fewest random points of a hold-out.  Where the largest error at 64 of them is within the tolerance, at most 5.6% of
         the other points are not, with 97.5% confidence; the bound extrapolates to all.
     workers: threads that evaluate.
-    max_evaluations, max_seconds: budgets for what comes after the axes, which are always evaluated.  max_evaluations counts
-        these and the one at the centre, and those of a store; time counts from the call.  Allowed only with a tolerance.
+    max_evaluations: budget, which counts the axes and the centre, always evaluated, and the points of a store.  Allowed only
+        with a tolerance.
     """
 
     tolerance: float | None = 0.01
     holdout: int = 64
     workers: int = 1
     max_evaluations: float = inf
-    max_seconds: float = inf
 
     def __post_init__(self) -> None:
         if self.tolerance is not None and not 0 < self.tolerance < 1:
             raise InputError(f"expected a tolerance between 0 and 1, or None for every point, got {self.tolerance}")
         if min(self.holdout, self.workers) < 1:
             raise InputError(f"expected holdout and workers of at least 1, got {self.holdout} and {self.workers}")
-        if not (self.max_evaluations >= 1 and self.max_seconds > 0):
-            raise InputError(
-                f"expected positive budgets, one evaluation or more, "
-                f"got {self.max_evaluations} evaluations and {self.max_seconds} seconds"
-            )
-        if self.tolerance is None and (self.max_evaluations, self.max_seconds) != (inf, inf):
+        if not self.max_evaluations >= 1:
+            raise InputError(f"expected a budget of one evaluation or more, got {self.max_evaluations}")
+        if self.tolerance is None and self.max_evaluations != inf:
             raise InputError("expected no budget for a slice of every point, got one; give a tolerance")
 
 
@@ -75,13 +70,13 @@ def evaluate_adaptively(
 ) -> Refined:
     """Evaluate points until the others are known to within the tolerance."""
     assert settings.tolerance is not None
-    begun, errors, looks, fill = monotonic(), np.empty(0), 0, COARSE
+    errors, looks, fill = np.empty(0), 0, COARSE
     evaluations.require(grid.axes)
     while not (known := evaluations.known).all():
         filling = grid.farthest(known, fill)
         drawn = _draw(known, filling, max(settings.holdout, fill), generator)
-        if reason := _spent(evaluations, settings, len(filling) + len(drawn), monotonic() - begun):
-            return Refined(evaluations.value, errors, looks, reason)
+        if 1 + int(known.sum()) + len(filling) + len(drawn) > settings.max_evaluations:
+            return Refined(evaluations.value, errors, looks, "evaluation budget")
         evaluations.require(filling)
         predicted = grid(evaluations.value)
         evaluations.require(drawn)
@@ -106,11 +101,3 @@ def _draw(known: np.ndarray, taken: np.ndarray, size: int, generator: torch.Gene
     unknown = np.setdiff1d(np.flatnonzero(~known), taken)
     order = torch.randperm(len(unknown), generator=generator, device=generator.device)
     return unknown[order[:size].cpu().numpy()]
-
-
-def _spent(evaluations: GridEvaluations, settings: SliceSettings, more: int, seconds: float) -> StopReason | None:
-    """The budget that has no room for so many more points, if any."""
-    if 1 + int(evaluations.known.sum()) + more > settings.max_evaluations:
-        return "evaluation budget"
-    made = evaluations.made  # points from a store take no time
-    return "time budget" if made and seconds * (1 + more / made) > settings.max_seconds else None

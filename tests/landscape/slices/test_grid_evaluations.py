@@ -66,18 +66,6 @@ def test_a_slice_that_continues_has_its_evaluations_in_total(tmp_path):
     assert found.reason == "evaluation budget" and found.evaluations == 118 and rest.calls == 118 - 48
 
 
-def test_a_slice_that_continues_has_its_whole_time_again(tmp_path, monkeypatch):
-    store, rest, limit = tmp_path / "slice.npz", Objective(), 150.0
-    settings = {"tolerance": 1e-4, "holdout": 8}
-    with pytest.raises(KeyboardInterrupt):
-        sliced(Objective(dies_after=100), store, **settings)
-    monkeypatch.setattr("landscape.slices.refinement.monotonic", lambda: float(rest.calls))  # a second each
-    found = sliced(rest, store, **settings, max_seconds=limit)
-    expected = 1 + 37 + (16 + 16) + (24 + 24) + (60 + 60)
-    assert found.reason == "time budget" and found.evaluations == expected > 100 + limit / 2
-    assert rest.calls <= limit
-
-
 def test_a_finer_tolerance_starts_from_what_a_coarser_one_found(tmp_path):
     store = tmp_path / "slice.npz"
     coarse = sliced(Objective(), store, tolerance=0.5)

@@ -170,11 +170,6 @@ def test_a_constant_is_known_from_the_first_hold_out():
     assert found.evaluations == 81 + 16 + 64 + 1 and (found.loss == 2.5).all() and found.interpolation_error == 0
 
 
-def test_time_ends_the_slice_after_its_axes():
-    found = sliced(crease, max_seconds=1e-9)
-    assert found.reason == "time budget" and found.evaluations == 82
-
-
 def test_points_that_were_not_evaluated_are_not_marked_discontinuous():
     found = sliced(lambda theta: (bowl(theta), bool(theta[0] > 0)))
     assert found.discontinuous is not None
@@ -187,5 +182,5 @@ def test_points_that_were_not_evaluated_are_not_marked_discontinuous():
 def test_settings_without_meaning_are_refused():
     misused("tolerance between 0 and 1", SliceSettings, tolerance=0.0)
     misused("at least 1", SliceSettings, holdout=0)
-    misused("positive budgets", SliceSettings, max_seconds=0.0)
+    misused("one evaluation or more", SliceSettings, max_evaluations=0)
     misused("no budget for a slice of every point", SliceSettings, tolerance=None, max_evaluations=9)
