@@ -46,14 +46,13 @@ def run_bench(options: BenchOptions) -> int:
     if options.subject == "stress":
         return run_stress(options.out)
     if options.checkpoint is not None:
-        return run_accuracy(options.checkpoint, options.out, options.downscale, options.repetitions)
+        return run_accuracy(options.checkpoint, options.out, options.repetitions)
     bench_scenes(options, meter_of(device_named(options.device)), Console())
     return 0
 
 
 def require(options: BenchOptions) -> None:
     """InputError where options do not go together."""
-    of_scene = isinstance(options.subject, Path) and options.subject.is_dir()
     refusals = {
         f"expected at least 1 repetition, got {options.repetitions}": options.repetitions < 1,
         f"expected bench accuracy RUN, or one subject alone, got {options.subject} and {options.checkpoint or 'no run'}": (
@@ -61,12 +60,6 @@ def require(options: BenchOptions) -> None:
         ),
         "expected a run, a scene or --sizes for the device cuda, as accuracy and stress are the CPU's; leave out --device": (
             options.device == "cuda" and options.subject in ("stress", "accuracy")
-        ),
-        "expected --images with a scene's folder; a run's images are those of its training": (
-            options.images is not None and not of_scene
-        ),
-        "expected --downscale with a scene's folder or bench accuracy, whose images it reduces": (
-            options.downscale != 1 and not of_scene and options.checkpoint is None
         ),
     }
     for sentence, wrong in refusals.items():
@@ -79,7 +72,7 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
     say(_about(meter.device), console=console)
     workloads = []
     if options.subject is not None:
-        workloads = [workload_of(Path(options.subject), options.images, options.downscale)]
+        workloads = [workload_of(Path(options.subject))]
     sizes = [Size.parse(text) for text in options.sizes or (() if workloads else SIZES)]
     options.out.mkdir(parents=True, exist_ok=True)
     times, bounds = [], []

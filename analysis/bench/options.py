@@ -28,10 +28,6 @@ class BenchOptions:
     sizes: Annotated[tuple[str, ...], arg(metavar="SIZE...", help_behavior_hint="")] = ()
     """Synthetic scenes to measure, GAUSSIANS@WIDTHxHEIGHT in pixels.
     Default: 10k@504x378 100k@504x378; none beside a run or a scene."""
-    images: str | None = None
-    """Of a scene's folder: the folder of images within it.  Default: images, else the largest images_K."""
-    downscale: float = 1.0
-    """Reduce the images of a scene's folder, or of accuracy's run, further by this factor."""
     device: Device = "auto"
     bounds: bool = False
     """Print the ratios that the project promises with their bounds, which bounds.csv has."""

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -63,16 +62,6 @@ class Workload:
         """The Gaussians on a device, where all that is computed of them is then computed; views stay where they are."""
         return replace(self, gaussians=self.gaussians.with_flat(self.gaussians.flat.to(device)))
 
-    def resized(self, factor: float) -> "Workload":
-        """The views with `factor` times as many pixels on a side."""
-        return replace(self, views=tuple(_resized(view, factor) for view in self.views))
-
-
-def _resized(view: View, factor: float) -> View:
-    size = max(1, round(factor * view.camera.width)), max(1, round(factor * view.camera.height))
-    image = F.interpolate(view.image[None], size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1)
-    return View(view.name, view.camera.resized(*size), image)
-
 
 def synthetic_workload(size: Size) -> Workload:
     """Four views of the synthetic scene, whose Gaussians have lost their exact colours, so that the loss is not at 0."""
@@ -86,7 +75,7 @@ def _discoloured(gaussians: Gaussians) -> Gaussians:
     return gaussians
 
 
-def workload_of(path: Path, images: str | None = None, downscale: float = 1.0) -> Workload:
+def workload_of(path: Path) -> Workload:
     """A checkpoint's Gaussians and training views; of a scene's folder the start: all its points, SH degree 3, three views.
 
     Raises FileNotFoundError or ValueError where the path is neither, or the scene has no points.
@@ -96,7 +85,7 @@ def workload_of(path: Path, images: str | None = None, downscale: float = 1.0) -
         training, scene, config = subject.checkpoint.training, subject.scene, subject.checkpoint.training.config
         views, name = tuple(scene.load(subject.checkpoint.scene.train)), f"{scene.name}, step {training.step}"
         return Workload(name, training.gaussians, views, scene.background, config.loss, config.render)
-    scene = load_scene(path, images, downscale)
+    scene = load_scene(path)
     if scene.points is None:
         raise InputError(f"expected a scene with points, got {path} without any; train it and give the checkpoint")
     views = tuple(scene.load(split_scene(scene, 3).train))

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from math import sqrt
 
 import numpy as np
+import pandas as pd
 import torch
-from jaxtyping import Float64
 from torch import Tensor
 
 from analysis.measures.depth import gradient_ratio
@@ -69,16 +69,10 @@ def opacity_one_view(values: Values) -> float:
 
     nan where either is the same for all.
     """
-    columns = [values[name].numpy() for name in ("trace_opacity_logits", "one_view")]
-    if any(np.ptp(column) == 0 for column in columns):
+    columns = [pd.Series(values[name].numpy()) for name in ("trace_opacity_logits", "one_view")]
+    if any(column.nunique() == 1 for column in columns):
         return float("nan")
-    return float(np.corrcoef([_ranks(column) for column in columns])[0, 1])
-
-
-def _ranks(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Ranks, of equal values their mean rank; scipy.stats would take half a second to load."""
-    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
-    return (np.cumsum(counts) - counts / 2)[place]
+    return float(columns[0].corr(columns[1], method="spearman"))
 
 
 def swaps(objective: SceneObjective, sights: Sequence[Sight], generator: torch.Generator, progress: Progress) -> Swaps:

@@ -49,7 +49,7 @@ PICTURES = {
 
 def run_compare(options: CompareOptions) -> int:
     """Read, probe where asked to, compare; returns the exit code."""
-    groups = groups_of(options.runs, options.group)
+    groups = groups_of(options.runs)
     paths = [folder for group in groups for folder in group.folders]
     folders = _folders(paths)
     common = Path(os.path.commonpath(folders))
@@ -83,15 +83,9 @@ def run_compare(options: CompareOptions) -> int:
         for path, label, checkpoint in zip(paths, labels, checkpoints)
     ]
     require_same_loss(runs)
-    named = [_relative(group, common) for group in groups]
+    named = [replace(group, label=os.path.relpath(Path(group.label).resolve(), common)) for group in groups]
     _write(runs, named, identical(labels, checkpoints), notes, options.out or common / "compare")
     return 0
-
-
-def _relative(group: Group, common: Path) -> Group:
-    """The group with its label as those of runs are, where it is a folder."""
-    path = Path(group.label).resolve()
-    return replace(group, label=str(path.relative_to(common))) if path.is_relative_to(common) else group
 
 
 def _folders(runs: Sequence[Path]) -> list[Path]:

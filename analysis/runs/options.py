@@ -58,8 +58,6 @@ class CompareOptions:
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
     """Two or more folders that landscape train wrote, or files of other tools, of the same views and loss, each probed.
     A folder whose sub-folders are runs, such as OUT/SCENE/METHOD of a sweep, stands for all its seeds: mean and spread."""
-    group: UseAppendAction[tuple[str, ...]] = ()
-    """LABEL=RUN,RUN: runs that differ in their seed alone, as one; may be repeated."""
     out: Path | None = None
     """Folder of the page, the table and the pictures.  Default: compare, in the folder that holds all runs."""
     probe: bool = False

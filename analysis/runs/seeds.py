@@ -16,7 +16,6 @@ from analysis.records.quantities import measured, quantity
 from analysis.records.run_files import CHECKPOINT
 from analysis.records.tables import Cell
 from analysis.runs.compare_table import Entry, Row
-from landscape.errors import InputError
 from splat.training.origin.subject import Checkpoint
 
 TOLD = ("held-out views", "trace", "spectrum", "anisotropy")  # sections whose differences are told
@@ -33,19 +32,14 @@ class Group:
     folders: tuple[Path, ...]
 
 
-def groups_of(runs: Sequence[Path], named: Sequence[str]) -> list[Group]:
-    """A group for each run, for each folder whose sub-folders are runs (a sweep's OUT/SCENE/METHOD), and each LABEL=RUN,RUN."""
+def groups_of(runs: Sequence[Path]) -> list[Group]:
+    """A group for each run, and for each folder whose sub-folders are runs (a sweep's OUT/SCENE/METHOD)."""
     groups = []
     for path in runs:
         seeds = (
             sorted(found.parent for found in path.glob(f"*/{CHECKPOINT}")) if not (path / CHECKPOINT).is_file() else []
         )
         groups.append(Group(str(path), tuple(seeds or [path])))
-    for text in named:
-        label, _, folders = text.partition("=")
-        if not (label and folders):
-            raise InputError(f"expected --group LABEL=RUN,RUN, got {text!r}")
-        groups.append(Group(label, tuple(Path(folder) for folder in folders.split(","))))
     return groups
 
 
@@ -131,8 +125,7 @@ def _verdict(rows: Sequence[Row], i: int, label: str, first: str, *, seeds: bool
             assert isinstance(here.value, float) and isinstance(there.value, float)
             votes[label if (here.value - there.value) * MORE[row.name] > 0 else first].append(row.name)
     why = [] if seeds else [
-        "one training of each says nothing of other seeds (landscape sweep trains them; give the folders that hold them, or "
-        "--group LABEL=RUN,RUN)"
+        "one training of each says nothing of other seeds (landscape sweep trains them; give the folders that hold them)"
     ]  # fmt: skip
     if uneven := _uneven(rows, i):
         why.append(uneven)

@@ -4,7 +4,7 @@
     ends      Lanczos to a residual of FINE
     sums      quadrature with STARTS x STEPS products
 
-The file belongs to one checkpoint at one size of its pictures.  The truth of the sums is known to half its brackets, a few
+The file belongs to one checkpoint.  The truth of the sums is known to half its brackets, a few
 percent; that of the diagonal, which would take a product for every row, is not.
 
 The scale of a block's trace is sum |H_ii| over the block (over all rows where the block is zero).  That of an end of the
@@ -114,18 +114,16 @@ class MeteredOperator:
         self.matvecs += matvecs
 
 
-def checkpoint_case(path: Path, out: Path, downscale: float = 1.0) -> Case:
+def checkpoint_case(path: Path, out: Path) -> Case:
     """The case of a checkpoint; its truth is read from OUT/truth.json, or computed and written there."""
     if not path.is_file():
         raise FileNotFoundError(f"expected a checkpoint as written by `landscape train`, got no file {path}")
     workload = workload_of(path)
-    if downscale != 1:
-        workload = workload.resized(1 / downscale)
     objective = SceneObjective(
         workload.gaussians, workload.views, workload.loss, workload.background, workload.settings
     )
     hessian = SceneHessian(objective)
-    key = {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "downscale": downscale, "dim": hessian.dim}
+    key = {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "dim": hessian.dim}
     stored = out / TRUTH
     kept = read_json(stored) if stored.is_file() else {}
     if kept.get("of") != key:

@@ -271,11 +271,11 @@ def squares(table: pd.DataFrame, floors: Mapping[str, float]) -> np.ndarray:
     return np.maximum(table["true_error"].fillna(np.inf).to_numpy(float), floor.to_numpy(float)) ** 2
 
 
-def run_accuracy(checkpoint: Path, out: Path, downscale: float, seeds: int) -> int:
+def run_accuracy(checkpoint: Path, out: Path, seeds: int) -> int:
     """Run every method with every seed; print, write and draw the results; returns the exit code 0."""
     console, errors = Console(), Console(stderr=True)
     out.mkdir(parents=True, exist_ok=True)
-    case = checkpoint_case(checkpoint, out, downscale)
+    case = checkpoint_case(checkpoint, out)
     jobs = [(method, seed) for method in scene_methods() if method.applies(case) for seed in range(seeds)]
     shown = track(jobs, "accuracy", console=errors, transient=True)
     table = pd.DataFrame(vars(run) for method, seed in shown for run in measure(case, method, seed))

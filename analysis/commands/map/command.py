@@ -23,7 +23,7 @@ import torch
 from rich.console import Console
 
 from analysis.commands.map.fields import ENDS, PROBE, Fields, in_words, measured_fields, require_known_field
-from analysis.commands.map.files import coloured_ply, csv_text, fields_ply, top_table
+from analysis.commands.map.files import coloured_ply, fields_ply, top_table
 from analysis.commands.map.pictures import error_shade, view_maps, write_maps
 from analysis.commands.options import MapOptions
 from analysis.console.drawing import Draw
@@ -158,8 +158,8 @@ def _write_files(
     (folder / "fields.ply").write_bytes(fields_ply(gaussians, objective.mask, values))
     (folder / f"{field}.ply").write_bytes(coloured_ply(gaussians, objective.mask, shade, values[field]))
     top = top_table(objective, values, field)
-    (folder / "top.csv").write_text(csv_text(top), encoding="utf-8")
-    return {name: column[0] for name, column in top.items()}
+    top.to_csv(folder / "top.csv", index=False, float_format="%.6g")
+    return dict(top.iloc[0])
 
 
 def _views_left_out(checkpoint: Checkpoint) -> list[str]:

@@ -1,12 +1,9 @@
 """The fields of a map in files that other programs open: PLYs of Gaussians, and a table."""
 
-import csv
-import io
-from collections.abc import Mapping
-
 import numpy as np
+import pandas as pd
 import torch
-from jaxtyping import Bool, Float64, Shaped
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from analysis.records.quantities import GREY, Shade
@@ -37,7 +34,7 @@ def coloured_ply(gaussians: Gaussians, seen: Bool[Tensor, " n"], shade: Shade, v
     return splat_ply(baked(Gaussians.pack(attributes).with_filter(gaussians.filter_widths)))
 
 
-def top_table(objective: SceneObjective, values: Values, by: str) -> dict[str, Shaped[np.ndarray, " m"]]:
+def top_table(objective: SceneObjective, values: Values, by: str) -> pd.DataFrame:
     """The Gaussians with the largest |field|, or the smallest `order_gap`: every number, place, size and opacity of each.
 
     gaussian: its number among all of the checkpoint.  sigma_0 to 2: standard deviations, world units, the largest first.
@@ -51,14 +48,4 @@ def top_table(objective: SceneObjective, values: Values, by: str) -> dict[str, S
     table |= {name: found[chosen].numpy() for name, found in values.items()}
     table |= dict(zip("xyz", active.means[chosen].double().numpy().T))
     table |= {f"sigma_{i}": sigma for i, sigma in enumerate(sigmas.numpy().T)}
-    return table | {"opacity": active.opacity_logits[chosen].double().sigmoid().numpy()}
-
-
-def csv_text(table: Mapping[str, Shaped[np.ndarray, " m"]]) -> str:
-    """Columns as CSV; pandas would take a third of a second to load."""
-    content = io.StringIO()
-    writer = csv.writer(content, lineterminator="\n")
-    writer.writerow(table)
-    columns = [[f"{value:.6g}" if column.dtype.kind == "f" else value for value in column] for column in table.values()]
-    writer.writerows(zip(*columns, strict=True))
-    return content.getvalue()
+    return pd.DataFrame(table | {"opacity": active.opacity_logits[chosen].double().sigmoid().numpy()})

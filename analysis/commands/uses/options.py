@@ -25,14 +25,9 @@ class PruneOptions:
     removal_error, removal_error_l2: the rise of the loss, or of the squared error, without the Gaussian, to second order.
     log_det_6, log_det_11, gn_diagonal: log-determinants of its Gauss-Newton block, PUP 3D-GS's and whole, and its diagonal.
     opacity, size_opacity: as they are."""
-    refine: int = 0
-    """Steps of training after it, without density control."""
     curve: bool = False
-    """Also score every --score at 0 to 95% removed, on training and held-out views, and after --curve-steps at 50% and 90%."""
-    curve_steps: int = 300
-    """Steps of training for the points of the curve with refinement; 0: none."""
-    curve_seeds: int = 3
-    """Seeds of that training, which say how far its end is decided."""
+    """Also score every --score at 0 to 95% removed, on training and held-out views, and after 300 steps at 50% and 90%,
+    without density control, of three seeds."""
     sample: int = 200
     """Gaussians that are really removed, one at a time, as the truth that scores are compared with."""
     seed: int = 0

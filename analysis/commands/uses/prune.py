@@ -56,7 +56,8 @@ L2 = LossSettings("l2", ssim_weight=0)
 REMOVED = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 REFINED = (0.5, 0.9)
 TRUTH = "error"
-CHOICE = ("keep", "score", "refine")  # about the pruned scene; the curve does not depend on them
+STEPS, SEEDS = 300, 3  # of training after the removal, for the curve, and of it
+CHOICE = ("keep", "score")  # about the pruned scene; the curve does not depend on them
 STAGES = ("true removals", *SCORES, *(f"{name} refined" for name in SCORES))
 Row = dict[str, str | int | float]
 
@@ -73,7 +74,7 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
         checkpoint, scene = subject.checkpoint, subject.scene
         objective, l2 = (subject.objective(loss=loss) for loss in (None, L2))
         held_out = scene.load(checkpoint.scene.test) if checkpoint.scene.test else []
-    amounts = {name: getattr(options, name) for name in ("curve", "curve_steps", "curve_seeds", "sample", *CHOICE)}
+    amounts = {name: getattr(options, name) for name in ("curve", "sample", *CHOICE)}
     tested = {name: checkpoint.scene.views[name] for name in checkpoint.scene.test}
     made = checkpoint.fingerprint(amounts, options.seed, further=tested)
     identity = made.but(*(f"settings.{name}" for name in CHOICE)).digest
@@ -88,7 +89,6 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
             curve.to_csv(folder / "curve.csv", index=False)
         with stages.stage("pruned"):
             training = pruned(checkpoint.training, objective, scores[options.score], options.keep)
-            refine(training, objective.views, options.refine, options.seed)
             scene_from_there = replace(checkpoint.scene, relative=os.path.relpath(scene.root, out.resolve()))
             _write_pruned(folder, replace(checkpoint, training=training, scene=scene_from_there))
         origin = provenance_of(made, subject, command)
@@ -105,9 +105,8 @@ def _require_sensible(options: PruneOptions) -> None:
     if not 0 < options.keep <= 1:
         hint = f"; for {options.keep:g}% say --keep {options.keep / 100:g}" if 1 < options.keep <= 100 else ""
         raise InputError(f"expected --keep as a share above 0 and up to 1, got {options.keep:g}{hint}")
-    for name, least in {"refine": 0, "curve_steps": 0, "curve_seeds": 2, "sample": 3}.items():
-        if (value := getattr(options, name)) < least:
-            raise InputError(f"expected --{name.replace('_', '-')} of at least {least}, got {value}")
+    if options.sample < 3:
+        raise InputError(f"expected --sample of at least 3, got {options.sample}")
     if options.score not in SCORES:
         raise InputError(
             f"expected --score {', '.join(SCORES)}, got {options.score!r}{did_you_mean(options.score, SCORES)}"
@@ -132,8 +131,6 @@ def pruned(training: Training, objective: SceneObjective, score: Float64[Tensor,
 
 def refine(training: Training, views: Sequence[View], steps: int, seed: int) -> None:
     """Train on, at the rates that the training ended with and without density control."""
-    if not steps:
-        return
     config = training.config
     rates = replace(config.rates, position=config.rates.position_final)
     training.config = replace(config, iterations=training.step + steps, rates=rates)
@@ -192,7 +189,8 @@ def _curve(
         rows = []
         for done, (removed, seed) in enumerate(at):
             training = pruned(checkpoint.training, objective, scores[name], 1 - removed)
-            refine(training, objective.views, steps, seed)
+            if steps:
+                refine(training, objective.views, steps, seed)
             found = _scored(training.gaussians, objective, held_out)
             rows.append({"score": name, "removed": removed, "steps": steps, "seed": seed, **found})
             report(done + 1, len(at), name)
@@ -200,11 +198,10 @@ def _curve(
 
     rows, first = list[Row](), options.seed
     plain = [(removed, first) for removed in REMOVED]
-    refined = [(removed, seed) for removed in REFINED for seed in range(first, first + options.curve_seeds)]
+    refined = [(removed, seed) for removed in REFINED for seed in range(first, first + SEEDS)]
     for name in SCORES:
         rows += kept.run(name, list[Row], partial(points, name, 0, plain)) or []
-        if steps := options.curve_steps:
-            rows += kept.run(f"{name} refined", list[Row], partial(points, name, steps, refined)) or []
+        rows += kept.run(f"{name} refined", list[Row], partial(points, name, STEPS, refined)) or []
     return pd.DataFrame(rows)
 
 

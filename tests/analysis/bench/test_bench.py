@@ -79,12 +79,6 @@ def test_memory_is_that_of_the_arrays(bench):
         assert least <= bench.workspace(K, Meter()) <= view.workspace(K) + blocks + objects
 
 
-def test_resizing_gives_a_workload_of_that_size():
-    workload = synthetic_workload(TINY)
-    assert workload.resized(0.5).pixels == 20 * 12
-    assert workload.resized(0.5).views[0].camera.fx == workload.views[0].camera.fx / 2
-
-
 def test_a_bench_records_times_and_the_bounds_that_are_asked(recorded):
     assert sorted(p.name for p in recorded.iterdir()) == ["bench.csv", "bounds.csv"]
     table, bounds = pd.read_csv(recorded / "bench.csv"), pd.read_csv(recorded / "bounds.csv")
@@ -127,8 +121,6 @@ def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
         (["--repetitions", "0"], "at least 1 repetition"),
         (["--sizes", "many"], "GAUSSIANS@WIDTHxHEIGHT"),
         (["nowhere"], "nowhere"),
-        (["--downscale", "2"], "--downscale with a scene's folder"),
-        (["--images", "images_4"], "--images with a scene's folder"),
         (["stress", "--device", "cuda"], "leave out --device"),
         (["accuracy"], "expected bench accuracy RUN"),
         (["stress", "run/checkpoint.pt"], "expected bench accuracy RUN"),

@@ -19,7 +19,7 @@ from splat.training.checkpoint import load_checkpoint
 from splat.training.score.evaluate import evaluate
 
 MADE = synthetic_scene(SyntheticSettings(gaussians=50, views=5, width=24, height=16))
-QUICK = ("--curve", "--curve-steps", "2", "--sample", "6")
+QUICK = ("--curve", "--sample", "6")
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,9 @@ def run(folder: Path, *words: str) -> int:
 
 @pytest.fixture(scope="module")
 def curved(folder) -> Path:
-    assert run(folder, *QUICK, "--keep", "0.4", "--score", "opacity") == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prune, "STEPS", 2)
+        assert run(folder, *QUICK, "--keep", "0.4", "--score", "opacity") == 0
     return folder / "prune"
 
 
@@ -76,15 +78,15 @@ def test_scores_are_compared_with_true_removals(curved):
 
 
 def test_refinement_lowers_the_training_loss_and_what_was_assumed_is_said(folder, tmp_path, capsys):
-    psnr = {}
-    for steps in (0, 20):
-        out = tmp_path / str(steps)
-        assert run(folder, "--sample", "3", "--keep", "0.3", "--refine", str(steps), "--out", str(out)) == 0
-        loaded = load_checkpoint(out / "checkpoint.pt")
-        views = loaded.with_scene(out / "checkpoint.pt").scene.load(loaded.scene.train)
-        psnr[steps] = evaluate(loaded.training.gaussians, views).psnr
-    assert psnr[20] > psnr[0] + 0.1
+    assert run(folder, "--sample", "3", "--keep", "0.3", "--out", str(tmp_path / "out")) == 0
     assert "trained by splat-landscape" in capsys.readouterr().err
+    loaded = load_checkpoint(tmp_path / "out" / "checkpoint.pt")
+    views, psnr = loaded.with_scene(tmp_path / "out" / "checkpoint.pt").scene.load(loaded.scene.train), []
+    for steps in (0, 20):
+        if steps:
+            prune.refine(loaded.training, views, steps, 0)
+        psnr.append(evaluate(loaded.training.gaussians, views).psnr)
+    assert psnr[1] > psnr[0] + 0.1
 
 
 def test_a_curve_that_is_stopped_goes_on(folder, curved, tmp_path, monkeypatch):
@@ -97,19 +99,19 @@ def test_a_curve_that_is_stopped_goes_on(folder, curved, tmp_path, monkeypatch):
         whole(*arguments)
 
     monkeypatch.setattr(prune, "refine", refined)
+    monkeypatch.setattr(prune, "STEPS", 2)
     monkeypatch.setattr(prune, "draw_or_say", lambda *_: [])
     words = [*QUICK, "--out", str(tmp_path / "out")]
     assert run(folder, *words) == 130 and not (tmp_path / "out").exists()
     assert run(folder, *words) == 0
-    every = len(SCORES) * (len(prune.REMOVED) + 3 * len(prune.REFINED)) + 1
-    assert len(calls) == every + 3  # of the second score, which was under way
+    every = len(SCORES) * prune.SEEDS * len(prune.REFINED)
+    assert len(calls) == every + 2  # of the fourth score, which was under way
     assert (tmp_path / "out" / "curve.csv").read_text() == (curved / "curve.csv").read_text()
     assert not (tmp_path / ".out.unfinished").exists()
 
 
 @pytest.mark.parametrize("words", [
-    ("--keep", "0"), ("--score", "opacty"), ("--sample", "1"), ("--refine", "-1"), ("--curve-steps", "-2"),
-    ("--curve-seeds", "1"),
+    ("--keep", "0"), ("--score", "opacty"), ("--sample", "1"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_alone(folder, words, capsys):
     assert run(folder, *words) == 2
