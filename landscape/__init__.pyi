@@ -10,10 +10,7 @@ from .eigen.power import PowerSettings as PowerSettings
 from .eigen.power import power_ends as power_ends
 from .eigen.power import power_iteration as power_iteration
 from .errors import InputError as InputError
-from .operators.checks import DerivativeCheck as DerivativeCheck
 from .operators.checks import OperatorCheck as OperatorCheck
-from .operators.checks import check_gradient as check_gradient
-from .operators.checks import check_objective as check_objective
 from .operators.checks import check_operator as check_operator
 from .operators.distributed import DistributedOperator as DistributedOperator
 from .operators.distributed import Ranks as Ranks

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.results import Number, StopReason, finite_or_none, plain
+from landscape.results import Number, StopReason, finite_or_none
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +70,3 @@ class EigenEnds:
 
     def __repr__(self) -> str:
         return f"largest   {self.largest!r}\nsmallest  {self.smallest!r}\n  by {self.method}, {self.matvecs} products"
-
-    def record(self) -> dict[str, object]:
-        ends = {"max": self.largest, "min": self.smallest}
-        pairs: dict[str, object] = {name: [end.record(i) for i in range(len(end))] for name, end in ends.items()}
-        return pairs | plain(self, "method matvecs beyond noise")

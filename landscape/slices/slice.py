@@ -58,11 +58,6 @@ class Slice:
         )
 
     @property
-    def difference(self) -> Float64[Tensor, "..."] | None:
-        """Loss minus quadratic model."""
-        return None if self.model is None else self.loss - self.model
-
-    @property
     def range(self) -> float:
         """The largest difference between finite evaluated values."""
         finite = self.loss[self.evaluated & self.loss.isfinite()]

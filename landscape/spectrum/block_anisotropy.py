@@ -59,14 +59,6 @@ class BlockAnisotropy(ShortRepr):
     density: SpectralDensity
     indices: Anisotropy
 
-    def record(self) -> dict[str, object]:
-        return {
-            "rank": self.rank,
-            "ends": self.ends.record(),
-            "indices": self.indices.record(),
-            "matvecs": self.ends.matvecs + self.density.matvecs,
-        }
-
 
 def block_anisotropies(
     operator: SymmetricOperator,

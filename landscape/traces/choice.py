@@ -33,7 +33,7 @@ from landscape.linalg import gram
 from landscape.operators.operator import SymmetricOperator
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.hutchinson import LEAST, Hutchinson, TraceSettings, joined
-from landscape.traces.sketches.sketched import by_identity, most_test_vectors, xtrace
+from landscape.traces.sketched import by_identity, most_test_vectors, xtrace
 
 WORSE = 4.0  # p_2 / r above which a sketch pays: 2 for the two products of a test vector, times kappa = 2
 EPS = torch.finfo(torch.float64).eps

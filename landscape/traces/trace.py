@@ -28,7 +28,7 @@ from landscape.results import Progress
 from landscape.traces.choice import chosen
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.hutchinson import Hutchinson, TraceSettings
-from landscape.traces.sketches.sketched import hutch_plus_plus, xtrace
+from landscape.traces.sketched import hutch_plus_plus, xtrace
 
 PAPER = TraceSettings.fixed(10, "gaussian")
 """StableGS's estimator, Eq. (6): ten Gaussian probes on one block at a time."""

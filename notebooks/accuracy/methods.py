@@ -1,6 +1,6 @@
 """Methods of the study beside those of a scene (`analysis.bench.accuracy.command`): of matrices, and of the diagonal."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -24,9 +24,9 @@ from analysis.bench.accuracy.command import (
 )
 from landscape.eigen.eigen import EigenSettings
 from landscape.eigen.power import PowerSettings, power_ends
-from landscape.traces.diagonal import Method as DiagonalMethod
-from landscape.traces.diagonal import estimate_diagonal
+from landscape.traces.diagonal import DiagonalEstimate, estimate_diagonal
 from landscape.traces.trace import TraceSettings
+from notebooks.accuracy.sketched_diagonal import chosen_diagonal
 
 BUDGETS = (12, 24, 48, 96)  # matvecs a block
 PROBES = (8, 16, 64)  # of a diagonal; 32 is the default
@@ -63,16 +63,18 @@ def _power(_: Case, operator: MeteredOperator, seed: int, rtol: float) -> list[A
 
 
 def diagonal_methods() -> Iterator[Method]:
-    names: dict[DiagonalMethod, str] = {"auto": "chosen by its probes", "signs": "random signs"}
-    for probes, (method, name) in product((32, *PROBES), names.items()):
-        origin: Origin = "default" if (probes, method) == (32, "auto") else "own"
-        run = partial(_diagonal, probes=probes, method=method)
+    names = {"chosen by its probes": chosen_diagonal, "random signs": estimate_diagonal}
+    for probes, (name, estimate) in product((32, *PROBES), names.items()):
+        origin: Origin = "default" if (probes, estimate) == (32, chosen_diagonal) else "own"
+        run = partial(_diagonal, probes=probes, estimate=estimate)
         yield Method("diagonal", name, f"{probes} probes", run, origin)
     yield Method("diagonal", "own blocks, no coupling", "one pass", _diagonal_of_blocks, applies=is_scene)
 
 
-def _diagonal(_: Case, operator: MeteredOperator, seed: int, probes: int, method: DiagonalMethod) -> list[Answer]:
-    found = estimate_diagonal(operator, generator(seed), probes, method=method)
+def _diagonal(
+    _: Case, operator: MeteredOperator, seed: int, probes: int, estimate: Callable[..., DiagonalEstimate]
+) -> list[Answer]:
+    found = estimate(operator, generator(seed), probes)
     half = float(student.ppf((1 + CONFIDENCE) / 2, found.samples.shape[1] - 1)) * found.standard_errors
     return [Answer("all", found.values, found.standard_errors, found.values - half, found.values + half)]
 

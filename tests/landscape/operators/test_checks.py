@@ -1,12 +1,9 @@
-from math import inf
-
 import numpy as np
 import pytest
 import torch
 
-from landscape.operators.checks import check_gradient, check_objective, check_operator
-from landscape.operators.objective import ObjectiveHessian
-from landscape.operators.operator import CountingOperator, DenseOperator, ScaledOperator
+from landscape.operators.checks import check_operator
+from landscape.operators.operator import CountingOperator, DenseOperator
 from tests.oracles import symmetric_matrix
 from tests.refusals import misused
 
@@ -78,75 +75,5 @@ def test_the_zero_operator_passes():
     assert check_operator(Any(lambda V: 0 * V), generator()).passed
 
 
-def loss(x):
-    return torch.cosh(x).sum() + (A @ x).square().sum() ** 2 / 100
-
-
-def gradient(x):
-    x = x.clone().requires_grad_()
-    return torch.autograd.grad(loss(x), x)[0]
-
-
-POINT = torch.randn(N, generator=generator(3), dtype=torch.float64) / 5
-DIRECTION = torch.nn.functional.normalize(torch.randn(N, generator=generator(4), dtype=torch.float64), dim=0)
-H = ObjectiveHessian(loss, POINT)
-
-
-def test_the_true_hessian_agrees_with_differences_of_the_gradient():
-    # at h = 1e-5: truncation of the order h^2 = 1e-10, round-off of eps / h = 2e-11, both times a constant of the loss
-    assert check_gradient(H, gradient, POINT, DIRECTION).error < 1e-8
-
-
-def test_the_true_hessian_agrees_with_second_differences_of_the_loss():
-    # at h = 1e-3: truncation of the order h^2 = 1e-6, round-off of eps |L| / h^2 = 2e-8
-    assert check_objective(H, loss, POINT, DIRECTION).error < 1e-5
-
-
-def test_a_hessian_that_is_one_percent_too_long_is_seen():
-    longer = ScaledOperator(H, torch.full((N,), 1.01**0.5, dtype=torch.float64))
-    by_gradient = check_gradient(longer, gradient, POINT, DIRECTION, steps=(1e-5,))
-    by_loss = check_objective(longer, loss, POINT, DIRECTION, steps=(1e-3,))
-    assert by_gradient.error == pytest.approx(0.01 / 1.01, abs=1e-8)  # the bounds of the two tests above
-    assert by_loss.error == pytest.approx(0.01 / 1.01, abs=1e-5)
-
-
-def test_steps_to_another_smooth_piece_are_skipped():
-    def smooth_piece(x):
-        return bool((x - POINT) @ DIRECTION > 5e-4)
-
-    check = check_gradient(H, gradient, POINT, DIRECTION, steps=(1e-2, 1e-3, 1e-4, 1e-5), smooth_piece=smooth_piece)
-    assert check.skipped == 2 and check.steps == (1e-4, 1e-5) and check.error < 1e-8
-
-
-def test_no_further_step_is_tried_once_one_is_good_enough():
-    steps = (1e-2, 1e-3, 1e-5, 1e-6)
-    every = check_gradient(H, gradient, POINT, DIRECTION, steps)
-    first = check_gradient(H, gradient, POINT, DIRECTION, steps, enough=every.errors[1])
-    assert first.steps == steps[:2] and first.error == every.errors[1] and first.skipped == every.skipped == 0
-
-
-def test_where_every_step_is_skipped_there_is_no_number():
-    check = check_gradient(H, gradient, POINT, DIRECTION, smooth_piece=lambda x: float(x.sum()))
-    assert check.skipped == 5 and check.record()["error"] is None
-
-
-def test_steps_must_be_positive():
-    misused("positive steps", check_gradient, H, gradient, POINT, DIRECTION, steps=(0.1, 0.0))
-
-
 def test_one_vector_cannot_show_symmetry():
-    misused("at least 2 vectors", check_operator, H, generator(), vectors=1)
-
-
-def test_a_step_where_the_loss_is_not_finite_proves_nothing():
-    def walled(x):
-        return loss(x) if float((x - POINT) @ DIRECTION) < 5e-3 else torch.tensor(torch.nan)
-
-    def steep(x):
-        return gradient(x) * (1.0 if float((x - POINT) @ DIRECTION) < 5e-3 else torch.nan)
-
-    by_loss, by_gradient = check_objective(H, walled, POINT, DIRECTION), check_gradient(H, steep, POINT, DIRECTION)
-    assert by_loss.error < 1e-5 and by_loss.errors[:2] == (inf, inf)
-    assert by_gradient.error < 1e-8 and by_gradient.errors[0] == inf
-    enough = check_gradient(H, steep, POINT, DIRECTION, enough=by_gradient.errors[2])
-    assert enough.steps == (1e-2, 1e-3, 1e-4)
+    misused("at least 2 vectors", check_operator, DenseOperator(A), generator(), vectors=1)

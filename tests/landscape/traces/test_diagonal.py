@@ -6,12 +6,11 @@ import torch
 
 from landscape.operators.operator import CountingOperator, DenseOperator
 from landscape.traces.diagonal import estimate_diagonal
-from tests.landscape.spectra import Buffered, generator
+from tests.landscape.spectra import generator
 from tests.oracles import symmetric_matrix
 from tests.refusals import misused
 
 N = 40
-BLOCKS = {"a": slice(0, 25), "b": slice(25, N)}
 INDEFINITE = torch.from_numpy(symmetric_matrix(np.linspace(-0.5, 1, N), seed=0))
 
 
@@ -34,13 +33,6 @@ def test_a_diagonal_matrix_is_exact():
     assert float(estimate.standard_errors.max()) < 1e-15
 
 
-def test_a_block_of_a_diagonal_is_its_rows():
-    estimate = estimate_diagonal(DenseOperator(INDEFINITE, BLOCKS), generator(), 8)
-    block = estimate.block("b")
-    assert torch.equal(block.values, estimate.values[25:]) and block.blocks == {"b": slice(0, 15)}
-    assert torch.equal(block.samples.mean(dim=1), block.values)
-
-
 def test_bad_input_is_refused():
     misused("at least 3 probes, got 2", estimate_diagonal, DenseOperator(INDEFINITE), generator(), 2)
 
@@ -49,13 +41,6 @@ def test_bad_input_is_refused():
             return super().apply(V) / 0
 
     misused("expected finite products H V", estimate_diagonal, Broken(INDEFINITE), generator())
-
-
-def test_an_operator_may_give_the_same_memory_at_every_call():
-    matrix = torch.from_numpy(symmetric_matrix(1 / np.arange(1, 121.0) ** 1.5, seed=1))
-    plain, buffered = (estimate_diagonal(H, generator(), 32) for H in (DenseOperator(matrix), Buffered(matrix)))
-    assert plain.method == buffered.method == "sketch"
-    assert torch.allclose(plain.values, buffered.values, rtol=1e-9)
 
 
 @pytest.mark.parametrize("size", [2.0**531, 2.0**-664])

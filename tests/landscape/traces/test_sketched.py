@@ -10,7 +10,7 @@ import torch
 from landscape.operators.operator import CountingOperator, DenseOperator
 from landscape.traces.choice import chosen
 from landscape.traces.hutchinson import TraceSettings
-from landscape.traces.sketches.sketched import _leave_out, hutch_plus_plus, xtrace
+from landscape.traces.sketched import _leave_out, hutch_plus_plus, xtrace
 from landscape.traces.trace import estimate_traces
 from tests.landscape.spectra import generator
 from tests.oracles import symmetric_matrix
@@ -199,7 +199,7 @@ def test_a_time_budget_holds_for_every_task_of_a_method(method, monkeypatch):
             seconds[0] += V.shape[1]
             return super().apply(V)
 
-    for module in ("trace", "hutchinson", "sketches.sketched"):
+    for module in ("trace", "hutchinson", "sketched"):
         monkeypatch.setattr(f"landscape.traces.{module}.monotonic", lambda: seconds[0])
     settings = TraceSettings(rtol=1e-6, max_probes=300, max_seconds=40, method=method)
     estimate = estimate_traces(Timed(matrix), generator(), settings)["all"]

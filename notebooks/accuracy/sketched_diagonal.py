@@ -13,6 +13,10 @@ QR decomposition, as in `sketched`.
 covariance, E (d_i - d_i^j) (d_j - d_j^i), where d_i^j is d_i with j left out of the sketch as well.  The covariance of a single
 row would be noisy.  Its ratio to the variance is assumed to be equal in all rows, is computed from up to ROWS of them, and
 widens the spread of the samples.
+
+The first half of the probes are signs.  Where their products show that a sketch pays, they become its test vectors; else the
+second half are signs, too.  As in `landscape.traces.choice`, a sketch pays where 4 r is below the variance of one sample of
+signs, summed over the entries; r is the squared norm of the part outside the sketch.
 """
 
 from dataclasses import dataclass
@@ -23,9 +27,46 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.linalg import gram
-from landscape.traces.sketches.sketched import left_out_directions
+from landscape.operators.operator import SymmetricOperator, product, products
+from landscape.probes import draw_probes
+from landscape.traces.choice import WORSE, outside_sketch
+from landscape.traces.diagonal import DiagonalEstimate, estimate_diagonal, mean_diagonal, require_squares
+from landscape.traces.hutchinson import joined
+from landscape.traces.sketched import added_directions, left_out_directions
 
+FEWEST = 4  # test vectors of a sketch
 ROWS = 16_384  # rows at a time
+
+
+def chosen_diagonal(
+    operator: SymmetricOperator, generator: torch.Generator, probes: int = 32, batch: int = 4
+) -> DiagonalEstimate:
+    """diag H by a sketch where that pays, from at most `probes` (3 or more) matvecs; else `estimate_diagonal`.
+
+    It is by signs with fewer than 8 probes, or with no more rows than probes.
+
+    >>> from landscape.operators.operator import DenseOperator
+    >>> v = torch.linspace(-1, 1, 100, dtype=torch.float64)
+    >>> found = chosen_diagonal(DenseOperator(torch.outer(v, v)), torch.Generator().manual_seed(0))
+    >>> found.method, found.matvecs, torch.allclose(found.values, v * v)  # a sketch is exact for a low rank
+    ('sketch', 17, True)
+    """
+    half, kept = probes // 2, []
+    if half < FEWEST or operator.dim <= probes:
+        return estimate_diagonal(operator, generator, probes, batch)
+    for start in range(0, half, batch):
+        Z = draw_probes(operator.dim, min(batch, half - start), generator, operator.dtype, "rademacher")
+        Y = product(operator, Z)
+        require_squares(Y)
+        kept.append((Z, Y.clone()))  # an operator may return the same buffer again
+    Z, Y = joined(kept)
+    signs = Z.double() * Y.double()
+    if WORSE * outside_sketch(Y) < float(signs.var(dim=1).sum()):
+        Q = added_directions(Y[:, :0], Y)
+        samples = sketched_samples(Z, Y, Q, products(operator, Q, batch))
+        return mean_diagonal(samples, operator, half + Q.shape[1], "sketch")
+    rest = estimate_diagonal(operator, generator, probes - half, batch)
+    return mean_diagonal(torch.cat([signs, rest.samples], dim=1), operator, probes, "signs")
 
 
 def sketched_samples(
