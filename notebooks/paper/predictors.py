@@ -37,7 +37,7 @@ QUANTITIES = (
 )  # fmt: skip
 COLUMNS = ("quantity", "kind", "tau", "low", "high", "p", "holm", "n", "clusters")
 SEED, DRAWS = 0, 999
-LEAST = 5
+LEAST, FLOOR = 5, 1e-3
 
 
 def predictors(rows: pd.DataFrame) -> pd.DataFrame:
@@ -66,12 +66,17 @@ def _lines(rows: pd.DataFrame) -> Iterator[dict]:
             tau, error, clusters = jackknife(values, scenes, methods, within=kind == "within")
             if clusters < LEAST or np.isnan(tau) or tau == error == 0:
                 continue
-            p = 2 * float(stdtr(clusters - 1, -abs(tau) / max(error, 1e-300)))
+            line = {"quantity": name, "kind": kind, "tau": tau, **interval(tau, error, clusters)}
             if kind == "within":
-                p = permuted(values, scenes, methods)
-            half = float(stdtrit(clusters - 1, 0.975)) * error
-            ends = {"low": max(tau - half, -1.0), "high": min(tau + half, 1.0)}
-            yield {"quantity": name, "kind": kind, "tau": tau, **ends, "p": p, "n": len(values), "clusters": clusters}
+                line["p"] = permuted(values, scenes, methods)
+            yield line | {"n": len(values), "clusters": clusters}
+
+
+def interval(tau: float, error: float, clusters: int) -> dict[str, float]:
+    """Ends of the 95% interval and two-sided p, of Student's t."""
+    half = float(stdtrit(clusters - 1, 0.975)) * error
+    p = 2 * float(stdtr(clusters - 1, -abs(tau) / max(error, 1e-300)))
+    return {"low": max(tau - half, -1.0), "high": min(tau + half, 1.0), "p": p}
 
 
 def jackknife(
@@ -130,7 +135,8 @@ def _tau(sums: np.ndarray) -> np.ndarray:
     taus = (sums / (sizes[..., None] * sizes[..., None, :]).clip(1e-300))[..., varies, :][..., varies]
     if taus.shape[-1] == 2:
         return taus[..., 0, 1]
-    P = np.linalg.pinv(np.sin(np.pi / 2 * taus), hermitian=True)
+    values, vectors = np.linalg.eigh(np.sin(np.pi / 2 * taus))  # of few runs not all are positive
+    P = vectors / values.clip(FLOOR)[..., None, :] @ np.swapaxes(vectors, -1, -2)
     r = -P[..., 0, 1] / np.sqrt(P[..., 0, 0] * P[..., 1, 1])
     return 2 / np.pi * np.arcsin(r.clip(-1, 1))
 
