@@ -8,7 +8,8 @@ RUNS    folder of the sweep; of every training that has ended, RUNS/SCENE/CELL/S
     psnr_train, psnr_test      dB, means over the views
     ..._error                  `notebooks.prediction.rows`
     ensemble                   with the other seeds whose trainings have ended too; again when there are more of them
-    digest, commit, date       of the checkpoint's Gaussians, of the code, of the measuring; seconds: of the processor
+    digest, scene_digest       of the checkpoint's Gaussians, and of its views
+    commit, date, seconds      of the code, of the measuring, of the processor
 
 The table is written after each row, and what it has is not measured again.  `OMP_NUM_THREADS=1` keeps to one processor.
 
@@ -45,7 +46,7 @@ COLUMNS = (
     "scene", "cell", "seed", "at", "reached", "step", "psnr_train", "psnr_test", "gaussians",
     *(name + suffix for name in MEASURES for suffix in ("", "_error")),
     "eigenvalue_ratio", "participation_ratio", "participation_ratio_low", "participation_ratio_high", "open_ratio",
-    ENSEMBLE, "digest", "commit", "date", "seconds",
+    ENSEMBLE, "digest", "scene_digest", "commit", "date", "seconds",
 )  # fmt: skip
 Key = tuple[str, str, int, str]
 

@@ -6,6 +6,7 @@ that were held out, POSES of them spread evenly; their photographs are in psnr_t
 beside it (`notebooks.prediction.poses.Measured`); of lambda it is the residual, of the participation ratio _low and _high.
 """
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from splat.curvature.traces import exact_traces
 from splat.scenes.splits import spread_views
 from splat.training.adam import Adam
 from splat.training.checkpoint import load_checkpoint
+from splat.training.origin.fingerprint import digest
 from splat.training.origin.subject import Subject
 from splat.training.score.evaluate import evaluate
 from splat.training.state import Training
@@ -59,7 +61,7 @@ def measured_row(path: Path) -> Row:
     opened, ratio = open_curvature(gaussians, seen, new)
     row |= columns("open_curvature", opened) | {"open_ratio": ratio}
     row |= columns("coadaptation", coadaptation(gaussians, new, seeded()))
-    return row | {"digest": subject.checkpoint.state}
+    return row | {"digest": subject.checkpoint.state, "scene_digest": scene_digest(subject)}
 
 
 def ensemble_columns(path: Path, others: list[Path]) -> Row:
@@ -68,6 +70,11 @@ def ensemble_columns(path: Path, others: list[Path]) -> Row:
     trained = [load_checkpoint(each).training.gaussians for each in others]
     found = ensemble(subject.checkpoint.training.gaussians, trained, new_poses(subject))
     return columns("ensemble", found) | {"ensemble_seeds": len(others)}
+
+
+def scene_digest(subject: Subject) -> str:
+    """Of poses, lenses, photographs and masks of all views that the training and its score are of."""
+    return digest({name: asdict(view) for name, view in subject.checkpoint.scene.views.items()})
 
 
 def seeded() -> torch.Generator:

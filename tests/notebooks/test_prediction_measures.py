@@ -240,6 +240,7 @@ def test_the_table_has_each_row_once_and_is_continued(tmp_path, monkeypatch):
         assert {name for name, value in first[at].items() if value != value} == {"ensemble", "ensemble_error"}
         assert first[at]["ensemble_seeds"] == 0
     assert first["end"]["digest"] == load_checkpoint(runs / "still" / "a" / "0" / "checkpoint.pt").state
+    assert first["end"]["scene_digest"] == first["1"]["scene_digest"]
 
     before = out.read_bytes()
     assert command.main([str(runs), "--only", "still/a/0", "--out", str(out)]) == 0
