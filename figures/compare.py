@@ -4,8 +4,8 @@ compare_traces      |trace| of every attribute with its interval; filled: positi
 compare_densities   the share of directions whose curvature is at most -x (left) or at least x (right), both axes logarithmic;
                     means over the start vectors of the quadrature, thin: each of these alone; dashed: the ends of the
                     spectrum
-compare_slices      the planes of the two steepest directions, cut to the steps that all slices reach, with the same levels;
-                    dots: renders
+compare_slices      the planes of the two steepest directions, cut to the steps that all slices reach along both, with the same
+                    levels; dots: renders
 compare_sections    the loss along each of these directions, as far as each slice goes
 """
 
@@ -27,15 +27,15 @@ from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.run_files import COMPARISON, read_comparison
 from analysis.records.schema import Trace
-from figures.plane import Plane, plane, same_scale
+from figures.manifold import Scale, contours
+from figures.plane import plane
 from figures.scripts import folder_script
 from figures.slice2d import RENDERED
-from figures.style import BLACK, COLUMN, FIELD_MAP, MISSING, RUNS, VERMILION, literal, new_figure, save, style
+from figures.style import BLACK, COLUMN, RUNS, VERMILION, literal, new_figure, save, style
 from landscape.errors import InputError
 
 Records = Mapping[str, Record[ProbeRecord]]
 LINES = ("-", "--", ":")  # once the colours are used up
-LEVELS = 12
 ACROSS = 3  # panels in a row
 WIDTH = 5.0  # inches for the panels of a row
 END: dict[str, Any] = {"linestyle": (0, (2, 2)), "linewidth": 0.6}
@@ -131,52 +131,27 @@ def beyond(nodes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def draw_slices(records: Records) -> Figure:
     """The planes in the window that all of them have."""
     planes = {label: plane(record) for label, record in records.items() if _has_surface(record)}
-    reach = [min(float(np.abs(getattr(field, axis).steps).max()) for field in planes.values()) for axis in "xy"]
-    exponent = exponent_of(*reach)
-    shown = np.concatenate([_within(field, *reach) for field in planes.values()])
-    low, high = float(shown.min()), float(shown.max())
-    power = exponent_of(high, low)
-    levels = MaxNLocator(LEVELS).tick_values(low / 10.0**power, high / 10.0**power)
+    scale = Scale.of(*planes.values())
     rows, columns = -(-len(planes) // ACROSS), min(len(planes), ACROSS)
-    same = same_scale(*reach)
-    shape = reach[1] / reach[0] if same else 0.75
     with style():
-        figure = new_figure(0.4 + (0.3 + min(WIDTH / columns * shape, TALLEST)) * rows, 2 * COLUMN)
+        figure = new_figure(0.4 + (0.3 + min(WIDTH / columns, TALLEST)) * rows, 2 * COLUMN)
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-        filled = None
-        for axes, (label, field) in zip(panels.ravel(), planes.items(), strict=False):
-            values = field.rise.T / 10.0**power
-            steps = field.x.steps / 10.0**exponent, field.y.steps / 10.0**exponent
-            axes.set_facecolor(MISSING)
-            filled = axes.contourf(*steps, values, levels=levels, cmap=FIELD_MAP, extend="both")
-            axes.contour(*steps, values, levels=levels, colors=BLACK, linewidths=0.4)
-            i, j = np.nonzero(field.dots)
-            axes.plot(steps[0][i], steps[1][j], **RENDERED)
-            axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
-            axes.set_title(literal(label), loc="left")
-            axes.set(
-                xlim=np.array([-1, 1]) * reach[0] / 10.0**exponent, ylim=np.array([-1, 1]) * reach[1] / 10.0**exponent
-            )
-            axes.set_aspect("equal" if same else "auto")
         for axes in panels.ravel()[len(planes) :]:
             axes.set_axis_off()
-        scales = "" if same else " (axes differ in scale)"
-        figure.supxlabel(f"step along the steepest, units of the parameters{unit_suffix(exponent)}{scales}", fontsize=7)
-        figure.supylabel(f"step along the second{unit_suffix(exponent)}", fontsize=7)
-        change = f"change of loss{unit_suffix(power)}"
-        figure.colorbar(filled, ax=panels, label=change, ticks=MaxNLocator(LEVELS // 2))  # pyright: ignore[reportArgumentType]
+        for axes, (label, field) in zip(panels.ravel(), planes.items(), strict=False):
+            filled = contours(axes, field, scale)
+            i, j = np.nonzero(field.dots)
+            axes.plot(field.x.steps[i] / 10.0**scale.steps, field.y.steps[j] / 10.0**scale.steps, **RENDERED)
+            axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
+            axes.set_title(literal(label), loc="left")
+            axes.label_outer()
+        figure.colorbar(filled, ax=panels, label=scale.loss_label)  # pyright: ignore[reportPossiblyUnboundVariable]
     return figure
 
 
 def _has_surface(record: Record[ProbeRecord]) -> bool:
     about = record.data.slice
     return "slice" in record.arrays and about is not None and about.is_resolved
-
-
-def _within(field: Plane, x: float, y: float) -> np.ndarray:
-    """The changes of the loss at the points of the window that are finite."""
-    inside = np.outer(np.abs(field.x.steps) <= x * (1 + 1e-9), np.abs(field.y.steps) <= y * (1 + 1e-9))
-    return field.rise[inside].compressed()
 
 
 def draw_sections(records: Records) -> Figure:

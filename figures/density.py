@@ -1,13 +1,11 @@
 """Figure: the density of the spectrum over curvature, smoothed by a Gaussian.
 
-`python -m figures.density RUN/probe` draws density.png beside the record.  From Python, `draw_density(found)` draws a
-`landscape.SpectralDensity` of any objective.  It is the mean of the start vectors' quadratures, each node a Gaussian of width
-sigma = BROADENING of the range; a peak narrower than sigma is not resolved.
+`draw_density(found)` draws a `landscape.SpectralDensity` of any objective, `figures.spectrum` that of a record: the mean of the
+start vectors' quadratures, each node a Gaussian of width sigma = BROADENING of the range; a narrower peak is not resolved.
 """
 
 from collections.abc import Mapping
-from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,12 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from analysis.console.failures import program
 from analysis.records.quantities import exponent_of, power_of_ten, quantity, unit_suffix
-from analysis.records.records import ProbeRecord, Record
-from figures.scripts import script
 from figures.style import BLUE, VERMILION, new_figure, style
-from landscape.errors import InputError
+from landscape.spectrum.density import SpectralDensity
 
 BROADENING = 0.01
 POINTS = 2000
@@ -28,18 +23,8 @@ DECADES = 8  # below the highest point
 ROOM = (5.0, 3.4, 1.6)  # decades above it: of words on the ends and the broadening
 
 
-class Quadrature(Protocol):
-    """nodes (starts, k): eigenvalues; weights (starts, k): the share of directions at each, of sum 1 over k."""
-
-    @property
-    def nodes(self) -> Any: ...
-
-    @property
-    def weights(self) -> Any: ...
-
-
-def draw_density(density: Quadrature) -> Figure:
-    """Density over curvature, logarithmic; density: see `Quadrature`."""
+def draw_density(density: SpectralDensity) -> Figure:
+    """Density over curvature, logarithmic."""
     with style():
         figure = new_figure(2.2)
         axes = figure.subplots()
@@ -92,20 +77,3 @@ def smooth_density(
     apart = (curvature[:, None] - nodes.ravel()) / sigma
     shares = weights.ravel() / weights.sum()
     return curvature, np.exp(-0.5 * apart**2) @ shares / (sigma * np.sqrt(2 * np.pi)), sigma
-
-
-def draw(record: Record[ProbeRecord]) -> Figure:
-    """The density of one record.  Raises InputError where none was recorded."""
-    arrays = record.arrays.get("spectrum", {})
-    if "nodes" not in arrays:
-        raise InputError(f"expected a spectral density in {record.folder}, got a record without; probe without --quick")
-    return draw_density(_OfRecord(arrays["nodes"], arrays["weights"]))
-
-
-class _OfRecord(NamedTuple):
-    nodes: np.ndarray
-    weights: np.ndarray
-
-
-if __name__ == "__main__":
-    program(partial(script, draw, "density", ProbeRecord))

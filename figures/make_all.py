@@ -40,8 +40,7 @@ def draw_probe(
 ) -> list[Path]:
     """Draw every figure that the record in `folder` has the numbers for into it, but for some; returns the files.
 
-    processes: that draw at a time.  Warns with `figures.surface.RendererMissing` where the surface had to be drawn without the
-    off-screen renderer.  Raises FileNotFoundError or ValueError for a folder that holds no readable record,
+    processes: that draw at a time.  Raises FileNotFoundError or ValueError for a folder that holds no readable record,
     TooLittleMemory where the system ends one of the processes.
     """
     record = read_record(folder)

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import AsinhNorm, LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.image import BboxImage
-from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse, Patch, Polygon, Rectangle
-from matplotlib.ticker import MaxNLocator, PercentFormatter
-from matplotlib.transforms import Affine2D, Bbox, TransformedBbox
+from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.ticker import AsinhLocator, FuncFormatter, MaxNLocator, PercentFormatter
 
 from analysis.console.failures import program
 from analysis.records.quantities import BYTES, Shade, percent, quantity, rough
@@ -38,122 +38,72 @@ from analysis.records.run_files import (
     read_maps,
 )
 from figures.scripts import folder_script
-from figures.style import BLACK, BLUE, GREEN, VERMILION, literal, save, style
+from figures.style import BLACK, BLUE, GREEN, VERMILION, few_decades, literal, new_figure, round_number, save, style
 
-BOUNDS = {"error": (0,), "one_view": (0, BYTES)}  # ends of a scale, in bytes, beyond which nothing is
+EXTEND: dict[str, Any] = {
+    "error": "max",
+    "one_view": "neither",
+}  # ends of a scale beyond which something is, if not both
 SAME = 0.02  # greatest difference of curves that look alike, of their axis
-NEAR = 0.03  # of a scale's length, from its end
 WIDTH, TALLEST = 7.0, 9.0  # inches
-MARGIN, HEAD, LEGEND = 0.12, 0.22, 0.5  # inches: between pictures, above one, beneath one
-BAR, ARROW, TICK = 0.09, 0.07, 0.03  # inches: of a scale, how high it is, and of its ends and its ticks
-FEWEST, DOTS = 110, 160  # an inch: as many as the photograph has pixels there, where these are between both, or DOTS
+HEAD, LEGEND = 0.35, 0.5  # inches: above a picture, beneath one with a scale
+DOTS = 160  # an inch
 
 
-class Sheet:
-    """Pictures of one shape in rows, each with room for a title above it and a scale beneath it.
-
-    Places are in inches from the top left.  Only plots have axes, which take longer to draw than pictures.
-    """
-
-    def __init__(
-        self, rows: int, columns: int, shape: tuple[int, int], legends: tuple[bool, ...], heading: str = ""
-    ) -> None:
-        aspect = shape[0] / shape[1]
-        self.across = (WIDTH - MARGIN * (columns + 1)) / columns
-        first = HEAD * (1 + bool(heading))
-        rest = first + (rows - 1) * HEAD + sum(legends) * LEGEND + MARGIN
-        self.across = min(self.across, (TALLEST - rest) / rows / aspect)
-        self.tall = self.across * aspect
-        self.size = (columns * (self.across + MARGIN) + MARGIN, rest + rows * self.tall)
-        self.tops = [first + sum(self.tall + HEAD + LEGEND * each for each in legends[:row]) for row in range(rows)]
-        dots = shape[1] / self.across
-        self.figure = Figure(figsize=self.size, dpi=dots if FEWEST <= dots <= DOTS else DOTS)
-        self.inches = Affine2D().scale(1 / self.size[0], -1 / self.size[1]).translate(0, 1) + self.figure.transFigure
-        self.text(MARGIN, 0.06, heading, fontsize=8.5)
-
-    def text(self, x: float, y: float, words: str, **how: Any) -> None:
-        """Words from the record, below (x, y) where `how` does not say otherwise."""
-        self.figure.text(x, y, literal(words), transform=self.inches, **{"va": "top", **how})
-
-    def show(self, row: int, column: int, image: UInt8[np.ndarray, "h w 3"], title: str) -> Affine2D:
-        """A picture with what it is above it; returns the way from its pixels to inches."""
-        left, top = self.corner(row, column, title)
-        self._image(image, left, top, self.across, self.tall)
-        return self.way(row, column, image)
-
-    def way(self, row: int, column: int, image: UInt8[np.ndarray, "h w ..."]) -> Affine2D:
-        """From the pixels of a picture that is shown there to inches."""
-        left, top = self.corner(row, column)
-        return Affine2D().scale(self.across / image.shape[1], self.tall / image.shape[0]).translate(left, top)
-
-    def show_scaled(
-        self, row: int, column: int, share: UInt8[np.ndarray, "h w"], shade: Shade, title: str, label: str
-    ) -> None:
-        """A map in bytes, with its scale beneath, and what that is of."""
-        self.show(row, column, shade.palette[share], title)
-        left, top = self.corner(row, column)
-        left, top, across = left + ARROW, top + self.tall + 0.05, self.across - 2 * ARROW
-        way = -1 if shade.falls else 1
-        self._image(shade.palette[None, : BYTES + 1][:, ::way], left, top, across, BAR)
-        for end, x, out in zip((0, BYTES)[::way], (left, left + across), (-1, 1), strict=True):
-            if end not in BOUNDS.get(shade.name, ()):
-                corners = [(x, top), (x + out * ARROW, top + BAR / 2), (x, top + BAR)]
-                colour = shade.palette[end] / 255
-                self.figure.add_artist(Polygon(corners, color=colour, linewidth=0, transform=self.inches))
-        for along, words in ticks_of(shade):
-            place = 1 - along if shade.falls else along
-            x, y = left + place * across, top + BAR
-            self.line([x, x], [y, y + TICK])
-            side = "left" if place < NEAR else "right" if place > 1 - NEAR else "center"
-            self.text(x, y + TICK + 0.02, words, ha=side, fontsize=6.5)
-        self.text(left + across / 2, top + BAR + 0.17, label, ha="center")
-
-    def line(self, x: list[float], y: list[float]) -> None:
-        self.figure.add_artist(Line2D(x, y, color=BLACK, linewidth=0.6, transform=self.inches))
-
-    def plot(self, row: int, column: int, title: str) -> Axes:
-        """Axes in a picture's place, with room for the numbers beside them."""
-        left, top = self.corner(row, column, title)
-        return self.figure.add_axes(self._box(left + 0.35, top, self.across - 0.4, self.tall).bounds)
-
-    def corner(self, row: int, column: int, title: str = "") -> tuple[float, float]:
-        """Left and top of a picture's place, below its title."""
-        left, top = MARGIN + column * (self.across + MARGIN), self.tops[row]
-        if title:
-            self.text(left, top - 0.05, title, va="bottom", fontsize=7.5)
-        return left, top
-
-    def _image(self, image: UInt8[np.ndarray, "h w 3"], left: float, top: float, wide: float, tall: float) -> None:
-        found = BboxImage(TransformedBbox(self._box(left, top, wide, tall), self.figure.transFigure))
-        found.set_data(image)
-        self.figure.add_artist(found)
-
-    def _box(self, left: float, top: float, wide: float, tall: float) -> Bbox:
-        across, down = self.size
-        return Bbox.from_bounds(left / across, 1 - (top + tall) / down, wide / across, tall / down)
+def _sheet(rows: int, columns: int, shape: tuple[int, int], legends: int) -> tuple[Figure, np.ndarray]:
+    """A figure with places for pictures of one shape, in rows, so many of them with scales."""
+    rest = rows * HEAD + legends * LEGEND
+    figure = new_figure(min(rest + rows * WIDTH / columns * shape[0] / shape[1], TALLEST), WIDTH)
+    figure.set_dpi(DOTS)
+    return figure, figure.subplots(rows, columns)
 
 
-def ticks_of(shade: Shade) -> list[tuple[float, str]]:
-    """Places within [0, 1], and their numbers."""
-    if shade.scale != "linear":
-        return shade.ticks()
-    values = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(shade.low, shade.high)
-    inside = [float(value) for value in values if shade.low <= value <= shade.high]
-    return [(float(shade.share(np.array(value))), f"{value:.3g}".replace("-", "−")) for value in inside]
+def _show(axes: Axes, image: UInt8[np.ndarray, "h w 3"], title: str) -> None:
+    """A picture with what it is above it."""
+    axes.imshow(image)
+    axes.set_axis_off()
+    axes.set_anchor("N")
+    axes.set_title(literal(title), loc="left")
+
+
+def show_scaled(axes: Axes, share: UInt8[np.ndarray, "h w"], shade: Shade, title: str, label: str) -> Colorbar:
+    """A map in bytes, with its scale beneath, and what that is of."""
+    _show(axes, shade.palette[share], title)
+    norms = {"log": LogNorm, "signed": partial(AsinhNorm, linear_width=shade.soft), "linear": Normalize}
+    colours = ScalarMappable(norms[shade.scale](shade.value(shade.low), shade.value(shade.high)), shade.colours)
+    figure: Any = axes.figure
+    bar = figure.colorbar(
+        colours,
+        ax=axes,
+        location="bottom",
+        label=literal(label),
+        extend=EXTEND.get(shade.name, "both"),
+        panchor=(0.5, 1.0),
+        aspect=30,
+        pad=0.03,
+    )
+    if shade.scale == "log":
+        few_decades(bar.ax.xaxis)
+    else:
+        bar.set_ticks(AsinhLocator(shade.soft, numticks=5) if shade.scale == "signed" else MaxNLocator(5), minor=False)
+        bar.ax.xaxis.set_major_formatter(FuncFormatter(round_number))
+    bar.minorticks_off()
+    if shade.falls:
+        bar.ax.invert_xaxis()
+    return bar
 
 
 def draw(maps: dict[str, np.ndarray], panel: Panel, record: MapRecord) -> Figure:
     """One view's panel."""
-    height, width = maps["error"].shape
     error, field = record.shades["error"], record.shades[record.field]
     with style():
-        sheet = Sheet(2, 2, (height, width), (False, True))
-        sheet.show(0, 0, maps["photograph"], f"Photograph, {Path(panel.name).name}")
-        sheet.show(0, 1, maps["render"], "Render" if panel.psnr is None else f"Render: {panel.psnr:.1f} dB")
+        figure, ((first, second), (third, fourth)) = _sheet(2, 2, maps["error"].shape, 1)
+        _show(first, maps["photograph"], f"Photograph, {Path(panel.name).name}")
+        _show(second, maps["render"], "Render" if panel.psnr is None else f"Render: {panel.psnr:.1f} dB")
         mean = error.low + (error.high - error.low) * maps["error"].mean() / BYTES
-        sheet.show_scaled(1, 0, maps["error"], error, f"Error: {mean:.3f} on average", error.unit)
-        sheet.show_scaled(1, 1, maps[record.field], field, f"Gaussians: {field.words}", field.unit)
-    return sheet.figure
+        show_scaled(third, maps["error"], error, f"Error: {mean:.3f} on average", error.unit)
+        show_scaled(fourth, maps[record.field], field, f"Gaussians: {field.words}", field.unit)
+    return figure
 
 
 def draw_fragility(maps: dict[str, np.ndarray], index: int, record: MapRecord) -> Figure:
@@ -166,12 +116,13 @@ def draw_fragility(maps: dict[str, np.ndarray], index: int, record: MapRecord) -
         "one_view": f"Opacity: {percent(fragile.one_view)} have over 90% of their weight in one view",
     }
     with style():
-        sheet = Sheet(2, 2, maps["error"].shape, (True, True), f"{view}: where it is fragile")
-        for place, (name, title) in enumerate(titles.items()):
+        figure, places = _sheet(2, 2, maps["error"].shape, 2)
+        figure.suptitle(literal(f"{view}: where it is fragile"))
+        for axes, (name, title) in zip(places.flat, titles.items(), strict=False):
             label = shades[name].title + ("" if name == "one_view" else "; bright: fragile")
-            sheet.show_scaled(place // 2, place % 2, maps[name], shades[name], title, label)
-        _draw_swaps(sheet.plot(1, 1, "Position: neighbours that change order when one moves"), fragile.swaps, index)
-    return sheet.figure
+            show_scaled(axes, maps[name], shades[name], title, label)
+        _draw_swaps(places[1, 1], fragile.swaps, index)
+    return figure
 
 
 def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
@@ -186,6 +137,7 @@ def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
     for line, (text, colour) in enumerate(words):
         axes.text(0.97, 0.13 - 0.08 * line, text, color=colour, ha="right", transform=axes.transAxes)
     axes.set(xlabel="distance along the ray, px", ylim=(0, 1))
+    axes.set_title("Position: neighbours that change order when one moves", loc="left")
     axes.set_xticks(ticks := [0.01, 0.1, 1, 10], labels=[f"{tick:g}" for tick in ticks])
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.minorticks_off()
@@ -201,31 +153,27 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
     )
     step, (back, _, forth) = quantity(end.step), map(_signed, changes)
     with style():
-        sheet = Sheet(2, 3, maps["view"].shape[:2], (False, True))
-        whole = sheet.show(0, 0, maps["view"], f"Photograph, {end.view.rpartition('/')[2]}")
-        frame = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BLACK, linewidth=1.0)
-        _inside(sheet, frame, whole, maps["view"])
-        parts = {
-            "photograph": (0, 1, f"Gaussians with {share} of {end.name}"),
-            "zero": (0, 2, f"Render: loss {quantity(end.losses[1])}"),
-            "minus": (1, 0, f"A step of {step} back: loss {back}"),
-            "plus": (1, 1, f"A step of {step} forth: loss {forth}"),
-        }
-        ways = {name: sheet.show(row, column, maps[name], title) for name, (row, column, title) in parts.items()} | {
-            "view": whole
-        }
-        sheet.show_scaled(1, 2, maps["difference"], end.difference, "Forth less back", end.difference.unit)
+        figure, places = _sheet(2, 3, maps["view"].shape[:2], 1)
+        axes = dict(zip(("view", "photograph", "zero", "minus", "plus", "difference"), places.flat, strict=True))
+        _show(axes["view"], maps["view"], f"Photograph, {end.view.rpartition('/')[2]}")
+        axes["view"].add_patch(
+            Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BLACK, linewidth=1)
+        )
+        _show(axes["photograph"], maps["photograph"], f"Gaussians with {share} of {end.name}")
+        _show(axes["zero"], maps["zero"], f"Render: loss {quantity(end.losses[1])}")
+        _show(axes["minus"], maps["minus"], f"A step of {step} back: loss {back}")
+        _show(axes["plus"], maps["plus"], f"A step of {step} forth: loss {forth}")
+        show_scaled(axes["difference"], maps["difference"], end.difference, "Forth less back", end.difference.unit)
         for name, shift in (("view", (0, 0)), ("photograph", (left, top))):
             for carrier in reversed(end.carriers):  # the first above the others
-                _inside(sheet, _outline(carrier, shift, _colour(carrier, end)), ways[name], maps[name])
-        x, y = sheet.corner(0, 1)
+                axes[name].add_patch(_outline(carrier, shift, _colour(carrier, end)))
         for line, carrier in enumerate(end.carriers):
-            sheet.text(
-                x + 0.08, y + sheet.tall - 0.08 - 0.16 * (len(end.carriers) - 1 - line),
-                f"{carrier.gaussian:,}: {percent(carrier.share)}", color=_colour(carrier, end), va="bottom",
+            axes["photograph"].text(
+                0.03, 0.95 - 0.12 * line, f"{carrier.gaussian:,}: {percent(carrier.share)}",
+                color=_colour(carrier, end), va="top", transform=axes["photograph"].transAxes,
                 bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.2},
             )  # fmt: skip
-    return sheet.figure
+    return figure
 
 
 def _signed(share: float) -> str:
@@ -241,13 +189,6 @@ def _outline(carrier: Carrier, shift: tuple[int, int], colour: str) -> Ellipse:
     x, y, long, short, angle = carrier.outline
     centre = (x - shift[0], y - shift[1])
     return Ellipse(centre, 2 * long, 2 * short, angle=math.degrees(angle), fill=False, edgecolor=colour, linewidth=0.8)
-
-
-def _inside(sheet: Sheet, patch: Patch, way: Affine2D, image: np.ndarray) -> None:
-    """A patch over a picture, in its pixels, without what is outside of it."""
-    patch.set_transform(way + sheet.inches)
-    sheet.figure.add_artist(patch)
-    patch.set_clip_path(Rectangle((0, 0), image.shape[1], image.shape[0], transform=way + sheet.inches))
 
 
 def draw_maps(folder: Path, suffix: str = "png", processes: int = 2) -> list[Path]:

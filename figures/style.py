@@ -4,6 +4,7 @@ Sizes are in inches, fonts in points.  Categories use the palette of Okabe and I
 uniform map cividis.  Figures are made without pyplot, so drawing has no global state.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,12 +13,15 @@ from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from PIL import Image
 
+from analysis.records.quantities import power_of_ten
 from landscape.errors import InputError
 from splat.model.untrusted import replacing, write_atomically
 
@@ -131,3 +135,25 @@ def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:
 def literal(text: str) -> str:
     """Text from a record, with nothing in it read as mathematics."""
     return text.replace("$", r"\$")
+
+
+def few_decades(axis: Axis) -> None:
+    """Ticks of a logarithmic axis: decades; where it spans less than two of them also 2 and 5; less than one: round numbers."""
+    low, high = axis.get_view_interval()
+    decades = LogLocator(subs=(1.0, 2.0, 5.0) if high < 100 * low else (1.0,), numticks=6)
+    axis.set_major_locator(MaxNLocator(3) if high < 8 * low else decades)
+    axis.set_major_formatter(FuncFormatter(round_number))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def round_number(value: float, _: int | None = None) -> str:
+    """A round number as the label of a tick.
+
+    >>> round_number(20.0), round_number(1e-5), round_number(-5e-5), round_number(0.0)
+    ('20', '10⁻⁵', '−5×10⁻⁵', '0')
+    """
+    exponent = math.floor(math.log10(abs(value)) + 1e-9) if value else 0
+    leading, sign = round(abs(value) / 10.0**exponent), "−" if value < 0 else ""
+    if -3 <= exponent <= 3:
+        return f"{sign}{abs(value):g}"
+    return sign + (f"{leading}×" if leading > 1 else "") + power_of_ten(exponent)

@@ -5,7 +5,6 @@ hollow where the number is negative.  Bands show 95% intervals of the traces, re
 participation ratio.  The title says what became of the steepest curvature.
 """
 
-import math
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,13 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from analysis.console.failures import program
-from analysis.records.quantities import power_of_ten, rough
+from analysis.records.quantities import rough
 from analysis.records.run_files import ENDS, read_trajectory
 from figures.scripts import table_script
-from figures.style import BLACK, RUNS, literal, new_figure, style
+from figures.style import BLACK, RUNS, few_decades, literal, new_figure, style
 from landscape.errors import InputError
 
 PANELS = {
@@ -112,7 +111,7 @@ def over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], name: s
             axes.plot(steps[sign], shown[sign], "o", color=colour, **look)
         least = np.fmin(low, high)[~bounded]
         axes.plot(steps[~bounded], np.where(least > 0, least, np.nan), color=colour, **ARROW)
-    _few_decades(axes)
+    few_decades(axes.yaxis)
 
 
 def marker_words(measured: pd.DataFrame, *names: str) -> list[Line2D]:
@@ -124,29 +123,6 @@ def marker_words(measured: pd.DataFrame, *names: str) -> list[Line2D]:
     hollow = Line2D([], [], marker="o", markerfacecolor="white", label="open: the number is negative", **look)
     arrow = Line2D([], [], color=BLACK, label="arrow: at least so large", **ARROW)
     return [hollow] * bool((values < 0).any()) + [arrow] * bool(bounds.any())
-
-
-def _few_decades(axes: Axes) -> None:
-    """Ticks of a logarithmic axis: decades; where it spans less than two of them also 2 and 5; less than one: round numbers."""
-    low, high = axes.get_ylim()
-    decades = LogLocator(subs=(1.0, 2.0, 5.0) if high < 100 * low else (1.0,), numticks=6)
-    axes.yaxis.set_major_locator(MaxNLocator(3) if high < 8 * low else decades)
-    axes.yaxis.set_major_formatter(FuncFormatter(_tick))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _tick(value: float, _: int | None) -> str:
-    """
-    >>> _tick(20.0, None), _tick(1e-5, None), _tick(5e-5, None), _tick(0.0, None)
-    ('20', '10⁻⁵', '5×10⁻⁵', '')
-    """
-    if value <= 0:  # which has no place
-        return ""
-    exponent = math.floor(math.log10(value) + 1e-9)
-    if -3 <= exponent <= 3:
-        return f"{value:g}"
-    leading = round(value / 10.0**exponent)
-    return power_of_ten(exponent) if leading == 1 else f"{leading}×{power_of_ten(exponent)}"
 
 
 def draw_named(path: Path) -> list[tuple[str, Figure]]:

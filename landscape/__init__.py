@@ -7,7 +7,7 @@ returns a frozen result that carries its error.  Bad arguments, and products tha
     operators     `ObjectiveHessian` of a torch function, `DenseOperator` of a matrix, and sums, restrictions, ... of these
     renderers     `RendererHessian` of any renderer with a gradient, differentiable only once, and `check_renderer`;
                   `gauss_newton_traces`, ... by its backward passes alone; `renderer_eigenpairs`; `Monitor` of a training
-    checks        `check_operator`, `check_gradient`, `check_objective`: is it the Hessian?
+    checks        `check_operator`: is it symmetric, are its products finite?
     estimators    `estimate_traces`, `estimate_diagonal`, `extreme_eigenpairs`, `spectral_density`
     indices       `anisotropy` of ends and a density; `block_anisotropies`: of the whole operator and of each of its blocks
     slices        `evaluate_slice` along `random_directions`, `gradient_direction`, ...; `finite_probe` at finite steps

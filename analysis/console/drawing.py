@@ -1,7 +1,6 @@
 """Pictures of a record: the figures' own commands, each run in a process of its own.
 
-`figures/` reads what this package wrote and is not imported here, so that the arrow between them points one way; a
-renderer that ends its process (VTK does, where OpenGL is missing) cannot take a probe along.
+`figures/` reads what this package wrote and is not imported here, so that the arrow between them points one way.
 """
 
 import os

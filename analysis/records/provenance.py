@@ -20,7 +20,7 @@ from splat.training.origin.fingerprint import Fingerprint
 if TYPE_CHECKING:
     from splat.training.origin.subject import Subject
 
-PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib", "pyvista", "plotly")
+PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib", "plotly")
 
 
 class Machine(Struct, kw_only=True):

@@ -6,7 +6,6 @@ spaces within a number are HARD, so that it is not broken over lines.
 """
 
 import math
-from collections.abc import Sequence
 from decimal import Decimal
 from typing import Literal
 
@@ -297,26 +296,6 @@ class Shade(Struct, frozen=True, kw_only=True):
         """`share` by `share_in_bytes`."""
         return share_in_bytes(self.share(values))
 
-    def ticks(self) -> list[tuple[float, str]]:
-        """(share, text) of round values within the scale; none of a linear one.
-
-        >>> Shade(name="x", words="", unit="", scale="log", low=-0.5, high=2.5).ticks()[1:]
-        [(0.5, '10'), (0.8333333333333334, '100')]
-        """
-        if self.scale == "linear":
-            return []
-        ends = [self.value(t) for t in (self.low, self.high)]
-        most = max(map(abs, ends))
-        sizes = most if self.scale == "signed" else ends[1]
-        least = ends[0] if self.scale == "log" else self.soft / 3
-        powers = range(math.ceil(math.log10(least)), math.floor(math.log10(sizes)) + 1)
-        values = [10.0**k for k in powers[:: -(-len(powers) // (2 if self.diverges else 4)) or 1]]
-        if len(values) < 2 and self.scale == "log":
-            values = [x * 10.0**k for k in range(math.floor(math.log10(least)), powers.stop + 1) for x in (1, 2, 5)]
-        values = values if self.scale == "log" else [*(-v for v in reversed(values)), 0.0, *values]
-        values = [v for v in values if ends[0] <= v <= ends[1]]
-        return list(zip(self.share(np.array(values)).tolist(), _labels(values), strict=True))
-
 
 def share_in_bytes(share: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     """[0, 1] as 0 to BYTES, nan as NOTHING.
@@ -325,22 +304,6 @@ def share_in_bytes(share: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     [0, 127, 254, 255]
     """
     return np.where(np.isnan(share), NOTHING, np.round(BYTES * np.clip(np.nan_to_num(share), 0, 1))).astype(np.uint8)
-
-
-def _labels(values: Sequence[float]) -> list[str]:
-    """Round numbers as labels, without trailing zeros; all as powers of ten where one needs it.
-
-    >>> _labels([-0.01, 0.0, 0.5]), _labels([-2e-5, 0.0, 1.0])
-    (['−0.01', '0', '0.5'], ['−2 × 10⁻⁵', '0', '1'])
-    """
-    exponents = [_exponent(value) for value in values]
-    plain, texts = all(-2 <= exponent <= 3 for exponent in exponents), []
-    for value, exponent in zip(values, exponents, strict=True):
-        text, digit = f"{abs(value):g}", round(abs(value) / 10.0**exponent)
-        if exponent and not plain:
-            text = (f"{digit} × " if digit > 1 else "") + power_of_ten(exponent)
-        texts.append("−" * (value < 0) + text)
-    return texts
 
 
 def _percentile(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], percent: float) -> float:

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import warnings
 from itertools import pairwise
 
 import numpy as np
@@ -20,14 +19,12 @@ from analysis.records.quantities import exponent_of
 from analysis.records.run_files import END_MAPS, Steepest
 from figures import make_all, maps, slice2d, spectrum, surface, traces
 from figures.plane import plane
-from figures.render_surface import Box
 from figures.style import BLACK, COLUMN, save, style
 from landscape.errors import TooLittleMemory
 from tests.recorded import long_numbers, synthetic, written, written_map
 from tests.refusals import refused
 
 POINT = 1 / 72  # inches
-BOX = Box(np.array([1.0, -1.55, 1.35]))
 
 
 def test_a_png_is_what_matplotlib_saves_and_takes_one_drawing(tmp_path, monkeypatch):
@@ -41,10 +38,6 @@ def test_a_png_is_what_matplotlib_saves_and_takes_one_drawing(tmp_path, monkeypa
     assert np.array_equal(np.asarray(drawn), np.asarray(saved.convert("RGB")))
     assert drawn.info["dpi"] == saved.info["dpi"]
     assert len(drawings) == 1
-
-
-def nothing_drawn(*_):
-    raise RuntimeError("no OpenGL here")
 
 
 def laid_out(figure, dpi=100):
@@ -117,12 +110,8 @@ CASES = ("plain", "1e-12", "1e9", "no numbers", "flat", "extremes", "least", "lo
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("module", [traces, spectrum, slice2d, surface], ids=lambda module: module.__name__)
-def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, monkeypatch, module, case):
-    monkeypatch.setattr(surface, "_rendered", nothing_drawn)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", surface.RendererMissing)
-        figure = module.draw(written(tmp_path / "probe", *difficult(case)))
-    require_layout(figure)
+def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, module, case):
+    require_layout(module.draw(written(tmp_path / "probe", *difficult(case))))
 
 
 def test_titles_of_renders_along_an_end_stay_apart(tmp_path):
@@ -280,16 +269,6 @@ def test_a_slice_without_a_finite_point_is_refused(tmp_path):
     refused("expected finite losses", slice2d.draw, written(tmp_path / "probe", data, arrays))
 
 
-def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypatch):
-    record = written(tmp_path / "probe", *synthetic())
-    (tmp_path / "broken.py").write_text("raise SystemExit('no OpenGL here')")
-    monkeypatch.setattr("analysis.console.drawing.ROOT", tmp_path)
-    monkeypatch.setattr(surface, "RENDERER", "broken")
-    with pytest.warns(surface.RendererMissing, match="no OpenGL here"):
-        figure = surface.draw(record)
-    assert "without the off-screen renderer" in figure.get_supxlabel()
-
-
 def test_the_command_draws_the_folder_named_on_its_standard_input(tmp_path):
     folder = written(tmp_path / "probe", *synthetic()).folder
     command = own_python("figures.make_all", "--without", "surface", "--without", "slice2d", "-")
@@ -308,43 +287,20 @@ def test_the_end_of_a_process_that_draws_is_said(tmp_path, monkeypatch):
         make_all.draw_probe(folder, without=["surface"], processes=2)
 
 
-def test_pyvista_marks_the_renders(tmp_path):
-    heights, dots = np.zeros((9, 9)), np.zeros((9, 9), bool)
-    dots[2, 6] = True
-    try:
-        marked = surface._rendered(BOX, heights, np.array([]), dots)
-    except RuntimeError as error:
-        pytest.skip(f"no off-screen renderer on this machine: {error}")
-    changed = np.abs(marked - surface._rendered(BOX, heights, np.array([]), dots & False)).sum(axis=-1) > 0.05
-    rows, columns = np.nonzero(changed)
-    place = np.array([columns.mean(), len(changed) - 1 - rows.mean()]) / len(changed)
-    assert place == pytest.approx(BOX.project(np.array([-0.5, 0.5, 0.006])), abs=0.005)
-
-
-def test_pyvista_renders_the_field_where_the_labels_are_put(tmp_path):
-    heights = np.zeros((9, 9))
-    heights[-1, :] = 1.0  # high at the right end of x
-    try:
-        image = surface._rendered(BOX, heights, np.array([]), np.zeros((9, 9), bool))
-    except RuntimeError as error:
-        pytest.skip(f"no off-screen renderer on this machine: {error}")
-    size = image.shape[0]
-    assert image.shape[:2] == (Box.PIXELS, Box.PIXELS)
-
-    def pixel(point):
-        column, row = BOX.project(np.array(point)) * size
-        return image[size - 1 - int(row), int(column), :3]
-
-    ink = np.argwhere(image[..., :3].min(axis=-1) < 0.95)
-    x, y = np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9), indexing="ij")
-    corners = BOX.project(np.stack([x, y, heights * Box.TOP], axis=-1).reshape(-1, 3)) * size
-    assert ink[:, 1].min() == pytest.approx(corners[:, 0].min(), abs=2)
-    assert ink[:, 1].max() == pytest.approx(corners[:, 0].max(), abs=2)
-    assert size - 1 - ink[:, 0].min() == pytest.approx(corners[:, 1].max(), abs=2)
-    assert size - 1 - ink[:, 0].max() == pytest.approx(corners[:, 1].min(), abs=2)
-    assert pixel((0, 0, 0))[2] > pixel((0, 0, 0))[0]  # low is blue
-    high = pixel((0.999, 0.0, 0.98 * Box.TOP))
-    assert high[0] > high[2]  # high is yellow
+def test_a_surface_marks_its_renders_and_has_true_proportions_or_says_that_it_has_not(tmp_path):
+    data, arrays = synthetic()
+    evaluated = np.zeros((21, 17), bool)
+    evaluated[[3, 20], 8] = True
+    arrays["slice"]["evaluated"] = evaluated
+    for stretch, said in ((1.0, False), (10.0, True)):
+        arrays["slice"]["y"] = stretch * arrays["slice"]["x"][2:19]
+        record = written(tmp_path / "probe", data, arrays)
+        figure, field = surface.draw(record), plane(record)
+        (dots,) = (line for line in figure.axes[0].lines if line.get_marker() == ".")
+        x, y, height = dots.get_data_3d()  # pyright: ignore[reportAttributeAccessIssue]
+        assert x == pytest.approx(field.x.scaled[[3, 20]]) and y == pytest.approx([field.y.scaled[8]] * 2)
+        assert height == pytest.approx(field.change[[3, 20], 8])
+        assert ("differ in scale" in figure.get_suptitle()) == said
 
 
 def test_a_figure_from_the_command_line_and_its_refusal(tmp_path):

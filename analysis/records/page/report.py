@@ -29,7 +29,6 @@ from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, re
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map, read_maps
 from analysis.records.schema import INDICES
 from analysis.records.tables import family_lines, number_rows
-from figures.eye import eye_over
 from landscape.errors import InputError
 from splat.model.untrusted import read_picture, write_atomically
 
@@ -289,8 +288,7 @@ def interactive_surface(record: Record[ProbeRecord]) -> dict[str, Any] | None:
         for each in about.directions
     ]  # plotly reads some tags in its texts
     change = {"title": {"text": f"change of loss{unit_suffix(exponent)}"}, "range": [low, high]}
-    eye = eye_over((loss / 10.0**exponent - low) / (high - low), 1.0)
-    camera = {"eye": dict(zip("xyz", eye, strict=True)), "center": {"x": 0, "y": 0, "z": -0.1}}
+    camera = {"eye": {"x": 0.7, "y": -1.1, "z": 1.5}, "center": {"x": 0, "y": 0, "z": -0.1}}  # so steep that no wall hides it
     box = {"aspectmode": "manual", "aspectratio": {"x": 1, "y": 1, "z": 0.5}}  # as high as half its width
     scene = {"xaxis": steps[0], "yaxis": steps[1], "zaxis": change, "camera": camera, **box}
     layout = {"scene": scene, "margin": dict.fromkeys("lrtb", 0), "height": 520, "legend": {"orientation": "h"}}

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from matplotlib.image import BboxImage
+from matplotlib.figure import Figure
 from PIL import Image
 
 from analysis.commands.cli import main
 from analysis.commands.map.pictures import composited
 from analysis.records.quantities import Shade
 from analysis.records.run_files import read_map
-from figures.maps import Sheet
+from figures.maps import show_scaled
 from splat.curvature.fields import FIELDS, scene_fields
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import read_splats
@@ -129,18 +129,18 @@ def test_a_scale_with_both_signs_has_0_in_its_middle(sign):
     shade = Shade.of("x", "", "", "signed", values, np.ones(5), (0.0, 100.0))
     assert shade.diverges and shade.share(np.array(0.0)) == 0.5
     assert float(shade.share(values)[4]) == (1 + sign) / 2
-    ticks = {text: place for place, text in shade.ticks()}
-    assert ticks["0"] == 0.5 and len(ticks) > 2 and np.isfinite([*ticks.values()]).all()
+    bar = show_scaled(Figure().subplots(), np.zeros((4, 6), np.uint8), shade, "", "")
+    ticks = [tick for tick in bar.get_ticks() if bar.vmin <= tick <= bar.vmax]
+    assert bar.vmin == -bar.vmax and 0.0 in ticks and len(ticks) > 2 and np.isfinite(ticks).all()
 
 
 def test_the_distance_to_a_swap_is_drawn_from_far_to_near_and_bright():
     shade = Shade(name="order_gap", words="", unit="px", scale="log", low=-1.0, high=1.0)
-    sheet = Sheet(1, 1, (4, 6), (True,))
-    sheet.show_scaled(0, 0, np.zeros((4, 6), np.uint8), shade, "", "")
-    bar = np.asarray(sheet.figure.findobj(BboxImage)[1].get_array())[0].astype(int)
-    assert bar[0].sum() < bar[-1].sum() and (bar[-1] == shade.palette[0]).all()
-    places = {text.get_text(): text.get_position()[0] for text in sheet.figure.texts}
-    assert places["10"] < places["1"] < places["0.1"]
+    axes = Figure().subplots()
+    bar = show_scaled(axes, np.zeros((4, 6), np.uint8), shade, "", "")
+    assert bar.ax.get_xlim() == pytest.approx((10.0, 0.1))
+    near, far = (np.array(bar.cmap(bar.norm(value))[:3]) for value in (0.1, 10.0))
+    assert far.sum() < near.sum() and near == pytest.approx(axes.images[0].get_array()[0, 0] / 255, abs=1 / 255)
     assert "to left" in shade.legend and shade.legend.index("10.0<") < shade.legend.index("0.100<")
 
 

@@ -54,10 +54,10 @@ def test_nothing_beside_a_scene_is_run_or_read_by_what_draws(tmp_path, monkeypat
     """Packages and modules, of names that are drawn with, and settings of matplotlib that ask for a program."""
     folder, marks = written(tmp_path / "probe", *synthetic()).folder, tmp_path / "ran"
     theirs = f"import os\nos.makedirs({str(marks)!r}, exist_ok=True)\nopen({str(marks)!r} + '/' + __name__, 'w')\n"
-    for name in ("figures", "analysis", "pyvista", "PIL"):
+    for name in ("figures", "analysis", "scipy", "PIL"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text(theirs)
-    for name in ("matplotlib", "random", "numpy", "sitecustomize", "figures/make_all", "render_surface", "traces"):
+    for name in ("matplotlib", "random", "numpy", "sitecustomize", "figures/make_all", "traces"):
         (tmp_path / f"{name}.py").write_text(theirs)
     (tmp_path / "matplotlibrc").write_text("text.usetex: True\nbackend: module://traces\n")
     monkeypatch.chdir(tmp_path)

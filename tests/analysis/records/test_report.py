@@ -20,7 +20,6 @@ from analysis.records.page.summary import summary
 from analysis.records.quantities import exponent_of
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
 from analysis.records.tables import probe_table
-from figures.eye import eye_over
 from splat.training.origin.fingerprint import Fingerprint, ViewData
 from tests.analysis.records.test_findings import sentences
 from tests.recorded import depth_section, long_numbers, probe_of, synthetic, written, written_map
@@ -261,8 +260,6 @@ def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
     change = arrays["slice"]["loss"] - data["slice"]["center_loss"]
     np.testing.assert_allclose(heights.T * 10.0 ** exponent_of(change), change, rtol=1e-6)
     np.testing.assert_allclose(layout["zaxis"]["range"], [heights.min(), heights.max()], rtol=1e-6)
-    span = np.ptp(heights)
-    assert (*layout["camera"]["eye"].values(),) == eye_over((heights.T - heights.min()) / span, 1.0)
 
 
 def test_text_of_the_record_cannot_become_markup(tmp_path):
