@@ -70,7 +70,9 @@ def show_scaled(axes: Axes, share: UInt8[np.ndarray, "h w"], shade: Shade, title
     """A map in bytes, with its scale beneath, and what that is of."""
     _show(axes, shade.palette[share], title)
     norms = {"log": LogNorm, "signed": partial(AsinhNorm, linear_width=shade.soft), "linear": Normalize}
-    colours = ScalarMappable(norms[shade.scale](shade.value(shade.low), shade.value(shade.high)), shade.colours)
+    colours = ScalarMappable(
+        norms[shade.scale](vmin=shade.value(shade.low), vmax=shade.value(shade.high)), shade.colours
+    )
     figure: Any = axes.figure
     bar = figure.colorbar(
         colours,

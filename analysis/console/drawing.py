@@ -30,14 +30,6 @@ def draw(module: str, target: Path) -> list[str]:
         return _said(process)
 
 
-def draw_or_say(module: str, target: Path) -> list[str]:
-    """Files of `draw`; where it fails, its words: the numbers stand without pictures."""
-    try:
-        return draw(module, target)
-    except RuntimeError as error:
-        return [" ".join(str(error).split())]
-
-
 @contextmanager
 def _group(module: str, *words: str | Path) -> Iterator[subprocess.Popen[str]]:
     """A process that ends with the block, and with it those that it has started: they would keep its output open for ever.

@@ -6,18 +6,10 @@ The help keeps the line breaks of their docstrings: a line is a sentence.
 
 from dataclasses import is_dataclass, replace
 from pathlib import Path
-from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, Suppress, arg
-from tyro.constructors import (
-    ConstructorRegistry,
-    PrimitiveConstructorSpec,
-    PrimitiveTypeInfo,
-    StructConstructorSpec,
-    StructFieldSpec,
-    StructTypeInfo,
-)
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from splat.training.origin.options import Foreign, Trainer
 
@@ -32,7 +24,6 @@ def registry(*, foreign: bool = True) -> ConstructorRegistry:
     None and flags go unsaid as defaults; a flag is only what it changes.
     """
     made = ConstructorRegistry()
-    made.primitive_rule(_optional_choices)
 
     def kind(of: Any, field: StructFieldSpec) -> Any:
         if isinstance(field.default, Trainer):
@@ -50,23 +41,6 @@ def registry(*, foreign: bool = True) -> ConstructorRegistry:
         return replace(found, fields=tuple(replace(each, type=kind(info.type, each)) for each in found.fields))
 
     return made
-
-
-def _optional_choices(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """Of Literal[...] | None: tyro's own rule names None among the choices where it refuses another."""
-    kinds = get_args(info.type)
-    choices = [kind for kind in kinds if get_origin(kind) is Literal]
-    if NoneType not in kinds or len(choices) != len(kinds) - 1:
-        return None
-    known = {str(value): value for kind in choices for value in get_args(kind)}
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=f"{{{','.join(known)}}}",
-        instance_from_str=lambda words: known[words[0]],
-        is_instance=lambda value: value is None or value in known.values(),
-        str_from_instance=lambda value: [str(value)],
-        choices=tuple(known),
-    )
 
 
 CheckpointPath = Annotated[

@@ -1,7 +1,6 @@
 """Limits by memory: how many vectors fit; and, before anything is measured, whether a probe or a slice does."""
 
 import re
-from dataclasses import dataclass
 from math import ceil
 
 from landscape import EigenSettings
@@ -44,28 +43,9 @@ def size_of(text: str | None) -> int | None:
     return int(float(match[1]) * unit ** (1 + "kmgt".index(match[2].lower())))
 
 
-@dataclass(frozen=True)
-class Needs:
-    """Estimated bytes.
-
-    vector: of a vector over the active parameters.  view: of the largest linearised view.  product: of a product, for each of
-    its vectors.  blocks: of the diagonal blocks of Gaussians that are kept.  making_blocks: of the pass that computes them.
-    """
-
-    vector: int
-    view: int
-    product: int
-    blocks: int
-    making_blocks: int
-
-    @property
-    def beside(self) -> int:
-        """Bytes needed in addition to linearised views: blocks, a small basis, and a product or the blocks' pass."""
-        return self.blocks + BASIS * self.vector + max(BATCH * self.product, self.making_blocks)
-
-
-def needs_of(objective: SceneObjective) -> Needs:
-    """What the largest view, its products and the blocks of the Gaussians need; renders every view."""
+def needs_of(objective: SceneObjective) -> tuple[int, int]:
+    """Estimated bytes of the largest linearised view, and beside the views: of the Gaussians' blocks, a small basis, and a
+    product or the pass that computes the blocks.  Renders every view."""
     active, settings = objective.active, objective.settings
     rasters = (
         rasterize_view(active, view.camera, objective.background, settings, finite=True) for view in objective.views
@@ -73,7 +53,7 @@ def needs_of(objective: SceneObjective) -> Needs:
     view, workspace, sums = max(LinearizedView.size_of(raster, active, settings) for raster in rasters)
     blocks = len(active) * active.flat.element_size() * (GEOMETRY_BLOCK + 3 * (active.sh_degree + 1) ** 2)
     product, making_blocks = workspace + COPIES * active.flat.nbytes, max(sums + blocks, 3 * blocks)
-    return Needs(active.flat.nbytes, view, product, KEPT_BLOCKS * blocks, making_blocks)
+    return view, KEPT_BLOCKS * blocks + BASIS * active.flat.nbytes + max(BATCH * product, making_blocks)
 
 
 def expected_peak(objective: SceneObjective) -> int:
@@ -81,9 +61,9 @@ def expected_peak(objective: SceneObjective) -> int:
 
     TooLittleMemory that says what would fit, where less is free.
     """
-    needs, device = needs_of(objective), objective.active.flat.device
+    (view, beside), device = needs_of(objective), objective.active.flat.device
     free, used = free_memory(device), resident_memory() if device.type == "cpu" else 0
-    least, camera = needs.view + needs.beside, objective.views[0].camera
+    least, camera = view + beside, objective.views[0].camera
     if least > free:
         fit = int(len(objective.active) * free / least)
         enough = (
@@ -96,8 +76,8 @@ def expected_peak(objective: SceneObjective) -> int:
             f"{camera.width} x {camera.height} px, got {_size(used + free)}, {_size(used)} of them taken; "
             f"{enough} would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
         )
-    objective.memory = min(free // 2, max(free - needs.beside, needs.view))
-    return used + min(free, len(objective.views) * needs.view + needs.beside)
+    objective.memory = min(free // 2, max(free - beside, view))
+    return used + min(free, len(objective.views) * view + beside)
 
 
 def _size(size: float) -> str:

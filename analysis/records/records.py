@@ -244,15 +244,8 @@ def read_record(folder: str | Path, kind: type[Data] | None = None) -> Record[Da
         raise FileNotFoundError(_why_not_found(folder, found.COMMAND, found.FILE))
     what = f"a record of `landscape {found.COMMAND}`"
     raw = plain_json(path, what, again)
-    match raw:
-        case {"format": {"name": found.FORMAT.name, "version": int(version)}}:
-            pass
-        case _:
-            raise InputError(f'expected {what} in {path}, got JSON without "format": {plain(found.FORMAT)}; {again}')
-    if version != found.FORMAT.version:
-        raise InputError(
-            f"expected a record of format version {found.FORMAT.version} in {path}, got version {version}; {again}"
-        )
+    if not (isinstance(raw, dict) and raw.get("format") == plain(found.FORMAT)):
+        raise InputError(f'expected {what} in {path}, got JSON without "format": {plain(found.FORMAT)}; {again}')
     data = fitted(raw, found, str(path), again)
     arrays = {group: _read_arrays(folder, group, data.arrays[group], again) for group in ARRAYS if group in data.arrays}
     if data.slice and "slice" in arrays and arrays["slice"]["loss"].ndim != len(data.slice.directions):

@@ -200,17 +200,14 @@ def _run(run: Run, options: TrainOptions, command: Sequence[str], along: Traject
         return code
     report(training, run.views, run.held_out, run.out, run.fingerprint)
     if trajectory:
-        say(*filter(None, (trajectory.skipped, trajectory.mixed)), style="yellow", console=console)
+        say(*filter(None, [trajectory.skipped]), style="yellow", console=console)
     return 0
 
 
 def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig, SceneReference]:
     """Plan of a training from its options; reads no image.  Raises ValueError or FileNotFoundError where they are wrong."""
     colour, preset = COLOURS.get(options.background or "scene"), presets(options.method, options.protocol)
-    scene = load_scene(
-        options.scene, options.images, options.downscale, colour, options.masks, options.depths,
-        strict_frames=options.strict_frames,
-    )  # fmt: skip
+    scene = load_scene(options.scene, options.images, options.downscale, colour, options.masks, options.depths)
     split = _split(options, scene)
     start = typed(Source, options.start or preset.get("start", "scene"), "start")
     reference = SceneReference.to(

@@ -32,8 +32,6 @@ class TrainOptions:
     """Folder within the scene.  Default: images or images_K."""
     downscale: float = 1.0
     """Factor that reduces the images."""
-    strict_frames: bool = False
-    """Refuse a scene's file that lists missing images."""
     start: Annotated[
         Literal["scene", "points", "triangulated", "dense", "random", "box"] | None, arg(metavar="NAME")
     ] = None

@@ -149,16 +149,6 @@ class Trajectory:
         notes = [row["note"] for row in self.rows if row["state"] == "skipped"]
         return f"of {len(self.rows)} records of the landscape {len(notes)} are empty: {notes[-1]}" if notes else ""
 
-    @property
-    def mixed(self) -> str:
-        """Sentence on records of other data, questions or formulas than those of today; empty without any."""
-        about = {name: str(value) for name, value in self._about().items() if name != "of_state"}
-        others = [row["step"] for row in self.rows if any(str(row.get(name)) != about[name] for name in about)]
-        if not others:
-            return ""
-        steps = ", ".join(map(str, others))
-        return f"records of step {steps} are of other views, settings or formulas than today's, and do not compare"
-
     def _about(self) -> Row:
         settings = asdict(replace(self.settings, every=1))  # which changes no number
         made = Checkpoint(self.training, self.reference).fingerprint(settings, self.training.config.seed)

@@ -110,7 +110,6 @@ def load_scene(
     masks: Path | None = None,
     depths: Path | None = None,
     points: bool = True,
-    strict_frames: bool = False,
 ) -> Scene:
     """Recognise and load the scene in a folder; pixels are read later.
 
@@ -121,7 +120,6 @@ def load_scene(
     masks, depths: folders of `splat/scenes/layers.py`, which need not have a file for every image.  Masks by default:
         those that the scene's files name, else a folder mask or masks in the scene, else those that DTU provides.
     points: whether to read a COLMAP model's points, which take longest.
-    strict_frames: whether to refuse a transforms file that lists frames without an image, instead of skipping these.
 
     Raises FileNotFoundError for a missing file and InputError for one that cannot be used, in one sentence.
 
@@ -143,7 +141,7 @@ def load_scene(
         )
     if not 1 <= downscale < float("inf"):
         raise InputError(f"expected downscale of at least 1, got {downscale}")
-    found = _read(root, images, points, strict_frames)
+    found = _read(root, images, points)
     photos = _with_layers(root, found.photos, masks, depths)
     require_files([photo.path for photo in photos] + [photo.mask for photo in photos if photo.mask])
     _require_distinct(photos, root)
@@ -173,7 +171,7 @@ class _Found(NamedTuple):
     notes: Sequence[str] = ()
 
 
-def _read(root: Path, images: str | None, points: bool, strict: bool) -> _Found:
+def _read(root: Path, images: str | None, points: bool) -> _Found:
     model = find_model(root)
     if model is not None:
         photos, cloud, notes = read_colmap(root, model, images, points=points)
@@ -183,11 +181,11 @@ def _read(root: Path, images: str | None, points: bool, strict: bool) -> _Found:
     if all((root / name).is_file() for _, name in BLENDER_FILES):
         if images is not None:
             raise InputError(f"expected no image folder for {root}, whose transforms files name theirs, got {images!r}")
-        photos, notes = read_blender(root, strict)
+        photos, notes = read_blender(root)
         return _Found("blender", photos, notes=[*notes, *_not_read(root, *(name for _, name in BLENDER_FILES))])
     for name in (SINGLE_FILE, BLENDER_FILES[0][1]):
         if (root / name).is_file():
-            photos, cloud, background, notes = read_transforms(root, root / name, images, strict)
+            photos, cloud, background, notes = read_transforms(root, root / name, images)
             return _Found("transforms", photos, cloud, background, [*notes, *_not_read(root, name)])
     if is_dtu(root):
         return _Found("dtu", read_dtu(root))

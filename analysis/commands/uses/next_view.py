@@ -25,7 +25,7 @@ from rich.table import Table
 from torch import Tensor
 
 from analysis.commands.uses.options import GEOMETRY, TWICE, NextViewOptions
-from analysis.console.drawing import draw_or_say
+from analysis.console.drawing import draw
 from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.records.json_files import json_text, plain
@@ -77,7 +77,7 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
         judged = checkpoint.fingerprint({"take": options.take, "by": options.by}, 0, further=data_of(scene, candidates))
         made = provenance_of(judged, subject, command)
         (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
-        notes = draw_or_say("uses", folder)
+        notes = draw("uses", folder)
     _conclude(table, options, out)
     say(*notes, *checkpoint.assumptions, style="yellow", console=Console(stderr=True))
     return 0

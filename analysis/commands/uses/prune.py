@@ -28,7 +28,7 @@ from torch import Tensor
 
 from analysis.commands.convert import own_file
 from analysis.commands.uses.options import PruneOptions
-from analysis.console.drawing import draw_or_say
+from analysis.console.drawing import draw
 from analysis.console.kept import Kept
 from analysis.console.plain import say
 from analysis.console.stages import Stages
@@ -93,7 +93,7 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
             _write_pruned(folder, replace(checkpoint, training=training, scene=scene_from_there))
         origin = provenance_of(made, subject, command)
         (folder / RECORD).write_text(json_text(plain(origin)), encoding="utf-8")
-        notes = draw_or_say("uses", folder) if curve is not None else []
+        notes = draw("uses", folder) if curve is not None else []
         result = _scored(training.gaussians, objective, held_out)
     shutil.rmtree(unfinished, ignore_errors=True)
     _conclude(ranks, curve, training.gaussians, result, out)

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from analysis.commands.uses.next_view import informations
 from analysis.commands.uses.options import UncertaintyOptions
-from analysis.console.drawing import draw_or_say
+from analysis.console.drawing import draw
 from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.records.json_files import json_text, plain
@@ -80,7 +80,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         of = checkpoint.fingerprint({"samples": options.samples}, options.seed, L2, tested)
         made = provenance_of(of, subject, command)
         (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
-        notes = draw_or_say("uses", folder)
+        notes = draw("uses", folder)
     means = table.drop(columns="view").pivot_table(index="precision")  # by default means
     words = (
         "ause: area under the sparsification error, 0 at best; ause_random: of an order that knows nothing",

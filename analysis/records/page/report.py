@@ -288,7 +288,10 @@ def interactive_surface(record: Record[ProbeRecord]) -> dict[str, Any] | None:
         for each in about.directions
     ]  # plotly reads some tags in its texts
     change = {"title": {"text": f"change of loss{unit_suffix(exponent)}"}, "range": [low, high]}
-    camera = {"eye": {"x": 0.7, "y": -1.1, "z": 1.5}, "center": {"x": 0, "y": 0, "z": -0.1}}  # so steep that no wall hides it
+    camera = {
+        "eye": {"x": 0.7, "y": -1.1, "z": 1.5},
+        "center": {"x": 0, "y": 0, "z": -0.1},
+    }  # so steep that no wall hides it
     box = {"aspectmode": "manual", "aspectratio": {"x": 1, "y": 1, "z": 0.5}}  # as high as half its width
     scene = {"xaxis": steps[0], "yaxis": steps[1], "zaxis": change, "camera": camera, **box}
     layout = {"scene": scene, "margin": dict.fromkeys("lrtb", 0), "height": 520, "legend": {"orientation": "h"}}

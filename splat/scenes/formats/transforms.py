@@ -57,19 +57,19 @@ USED = {  # the two applied_ ones by `splat/training/origin/frames.py`
 NO_MATTER = {"rotation", "sharpness", "colmap_im_id"}  # steps and marks of whoever made the file
 
 
-def read_blender(root: Path, strict: bool = False) -> tuple[list[Photo], list[str]]:
+def read_blender(root: Path) -> tuple[list[Photo], list[str]]:
     """Training photographs, then test photographs, named by their path (`train/r_26`); and notes."""
     photos, skipped, unused = [], [], []
     for subset, name in BLENDER_FILES:
         data = _load(root / name)
         paths = [image_named(inside(root, frame["file_path"])) for frame in data["frames"]]
-        found, missing = _photos(root / name, data, paths, dict.fromkeys(map(_name, data["frames"]), subset), strict)
+        found, missing = _photos(root / name, data, paths, dict.fromkeys(map(_name, data["frames"]), subset))
         photos, skipped, unused = photos + found, skipped + missing, unused + _unused(data, name)
     return photos, [*_skipped(skipped, len(photos)), *unused]
 
 
 def read_transforms(
-    root: Path, path: Path, images: str | None = None, strict: bool = False
+    root: Path, path: Path, images: str | None = None
 ) -> tuple[list[Photo], Points | None, list[float] | None, list[str]]:
     """Photographs sorted by name, the points of `ply_file_path` and the background, where the file has them; and notes."""
     data = _load(path)
@@ -79,7 +79,7 @@ def read_transforms(
         folder = image_folder(root, images)
         paths = [_in_folder(folder, frame["file_path"]) for frame in data["frames"]]
     subsets = _subsets(data, path)
-    photos, skipped = _photos(path, data, paths, subsets, strict)
+    photos, skipped = _photos(path, data, paths, subsets)
     points = None
     if cloud := _file(data, "ply_file_path", path):
         points = read_points(inside(root, cloud), tuple(_name(frame) for frame in data["frames"]))
@@ -93,7 +93,7 @@ def _skipped(names: Sequence[str], there: int) -> list[str]:
     """A note on frames without an image."""
     count = f"{len(names)} of {len(names) + there} frames that the scene lists were skipped"
     first = f"because their images are missing; the first is {names[0]}" if names else ""
-    return [f"{count}, {first} (--strict-frames refuses such a scene)"] if names else []
+    return [f"{count}, {first}"] if names else []
 
 
 def _unused(data: Mapping[str, Any], name: str) -> list[str]:
@@ -154,13 +154,11 @@ def _posix(path: str) -> str:
 
 
 def _photos(
-    path: Path, data: dict[str, Any], paths: list[Path], subsets: Mapping[str, Subset], strict: bool
+    path: Path, data: dict[str, Any], paths: list[Path], subsets: Mapping[str, Subset]
 ) -> tuple[list[Photo], list[str]]:
-    """The frames that have an image, and the names of the others; strict, or where none has one: refuses."""
+    """The frames that have an image, and the names of the others; refuses where none has one."""
     if not any(image.is_file() for image in paths):
         require_files(paths, f"where {path} says, or name another folder of images with --images")
-    if strict:
-        require_files(paths, "or leave out --strict-frames")
     shared = {key: value for key, value in data.items() if key != "frames"}
     photos, skipped = [], []
     for frame, image in zip(data["frames"], paths):

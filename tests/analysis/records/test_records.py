@@ -305,7 +305,7 @@ def test_a_newer_format_is_refused_with_what_to_do(tmp_path):
     raw = json.loads((folder / "probe.json").read_text(encoding="utf-8"))
     raw["format"]["version"] = ProbeRecord.FORMAT.version + 1
     (folder / "probe.json").write_text(json.dumps(raw))
-    with pytest.raises(ValueError, match=r"expected a record of format version 1 in .*, got version 2; probe again"):
+    with pytest.raises(ValueError, match=r"expected a record of `landscape probe` in .*; probe again"):
         read_record(folder)
 
 

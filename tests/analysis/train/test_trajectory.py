@@ -86,10 +86,6 @@ def test_the_last_row_is_that_of_the_checkpoint(run, at_the_end, tmp_path):
     assert {key: again[key] for key in again if key not in (*TIMES, "note")} == {
         key: written[key] for key in again if key not in (*TIMES, "note")
     }
-    assert trajectory.mixed == ""
-    for part in ("of_data", "of_question", "of_formulas"):
-        trajectory.rows = [again | {part: "another", "step": 3}, again]
-        assert trajectory.mixed.startswith("records of step 3 are of other views, settings or formulas than today's")
 
 
 def test_the_search_for_the_ends_begins_at_the_directions_of_single_gaussians(at_the_end, monkeypatch):

@@ -100,7 +100,7 @@ def test_a_curve_that_is_stopped_goes_on(folder, curved, tmp_path, monkeypatch):
 
     monkeypatch.setattr(prune, "refine", refined)
     monkeypatch.setattr(prune, "STEPS", 2)
-    monkeypatch.setattr(prune, "draw_or_say", lambda *_: [])
+    monkeypatch.setattr(prune, "draw", lambda *_: [])
     words = [*QUICK, "--out", str(tmp_path / "out")]
     assert run(folder, *words) == 130 and not (tmp_path / "out").exists()
     assert run(folder, *words) == 0

@@ -136,8 +136,6 @@ def test_frames_without_an_image_are_skipped_and_counted(tmp_path: Path) -> None
     (note,) = scene.notes
     assert note.startswith("1 of 3 frames that the scene lists were skipped") and "first is images/a.png " in note
     assert scene.points is not None and scene.points.sightings(scene.frames).tolist() == [1, 2]
-    words = "3 image files, 1 are missing, the first is .*leave out --strict-frames"
-    refused(words, load_scene, tmp_path, strict_frames=True, error=FileNotFoundError)
 
 
 def test_a_blender_scene_skips_frames_of_both_files(tmp_path: Path) -> None:
