@@ -56,7 +56,7 @@ def draw(record: Record) -> Figure:
         axes.tick_params(labelsize=6, pad=-3)
         axes.set_proj_type("ortho")
         axes.view_init(elev=50, azim=-58)  # so steep that no wall hides the centre
-        axes.set_box_aspect((wide, deep, max(wide, deep) / 2), zoom=0.85)  # pyright: ignore[reportArgumentType]
+        axes.set_box_aspect((wide, deep, max(wide, deep) / 2), zoom=0.75)  # pyright: ignore[reportArgumentType]
         figure.colorbar(colours, ax=axes, label=field.label, shrink=0.75, pad=0.08, aspect=20)
         curvatures = ", ".join(f"{d.name} {quantity(d.curvature)}" for d in (field.x, field.y))
         flat = "" if high > low else "\nthe loss is the same at every point"
