@@ -1,4 +1,4 @@
-"""Command lines of the figures: `python -m figures.NAME` of a record's folder, of a table, or of two runs.
+"""Command lines of the figures: `python -m figures.NAME` of a record's folder, or of a table.
 
 Each prints the files that it has written and returns the exit code: 2 where its input is not what it expects, which it says on
 stderr.
@@ -69,18 +69,6 @@ def table_script(draw: Callable[[Path], Iterable[tuple[str, Figure]]], what: str
     return print_files(drawn)
 
 
-def runs_script(draw: Callable[[Sequence[Path]], Figure], name: str) -> int:
-    """Draw two runs into a file."""
-    parser = ArgumentParser(description=f"Draw {name} from the records of two runs.")
-    parser.add_argument(
-        "runs", type=Path, nargs=2, metavar="RUN", help="folders of landscape train: 3DGS, then StableGS"
-    )
-    parser.add_argument("--out", type=Path, default=Path(f"{name}.png"), help="PNG, PDF or SVG, by its suffix")
-    options = _add_paper(parser).parse_args()
-    out = options.out.with_suffix(f".{options.format}") if options.format else options.out
-    return print_files(lambda: [save(draw(options.runs), out)])
-
-
 def print_files(draw: Callable[[], Iterable[Path]]) -> int:
     """Print each file as it is written, or what is wrong with the input; returns the exit code."""
     try:
@@ -94,10 +82,10 @@ def print_files(draw: Callable[[], Iterable[Path]]) -> int:
 
 def _add_format(parser: ArgumentParser) -> None:
     parser.add_argument("--format", choices=SUFFIXES, default="png")
-    _add_paper(parser)
+    add_paper(parser)
 
 
-def _add_paper(parser: ArgumentParser) -> ArgumentParser:
+def add_paper(parser: ArgumentParser) -> ArgumentParser:
     words = f"as a paper has it: NAME{PAPER}, columns wide, serif, panels lettered, the caption beside it"
     parser.add_argument("--paper", dest="format", action="store_const", const=PAPER[1:], help=words)
     return parser

@@ -37,7 +37,7 @@ from analysis.records.records import SliceRecord, record_folder, recorded_probe,
 from analysis.records.schema import FiniteProbe
 from analysis.slice.directions import Direction, Shape, at_right_angles, axis_of, cosine, find_directions
 from analysis.slice.options import SliceOptions
-from analysis.slice.record import Found, LeftOut, slice_arrays, slice_record
+from analysis.slice.record import Found, slice_arrays, slice_record
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
 from landscape.errors import InputError
 from landscape.probes import spawn
@@ -190,9 +190,9 @@ def _measure(
         with stages.stage("finite steps") as report:
             steps = [reach * step for step in DECADES]
             probe = finite_probe(_evaluation(objective, 1), center, vectors[:, 0], true, steps, report)
-    left_out = None if population is None else LeftOut(population, hessian.by_view(vectors))
+    by_view = None if population is None else hessian.by_view(vectors)
     matvecs = operator.matvecs + true.matvecs
-    return Found(found, probe, directions, vectors, cosine(exact), loss_scale, matvecs, left_out)
+    return Found(found, probe, directions, vectors, cosine(exact), loss_scale, matvecs, population, by_view)
 
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:

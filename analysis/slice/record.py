@@ -20,7 +20,10 @@ from splat.curvature.objective import SceneObjective
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A slice and its directions, also as columns.  probe: the finite steps of a line; cosine: see `schema.Slice`."""
+    """A slice and its directions, also as columns.  probe: the finite steps of a line; cosine: see `schema.Slice`.
+
+    population: the training's views, where fewer are measured; by_view: then the curvatures in each of these.
+    """
 
     slice: Slice
     probe: FiniteProbe | None
@@ -29,15 +32,8 @@ class Found:
     cosine: float | None
     loss_scale: float
     matvecs: int
-    left_out: "LeftOut | None" = None
-
-
-@dataclass(frozen=True, eq=False)
-class LeftOut:
-    """Curvatures of the directions in each view, for the error of fewer views than the `population` that the training has."""
-
-    population: int
-    curvatures: Float64[Tensor, "m d"]
+    population: int | None = None
+    by_view: Float64[Tensor, "m d"] | None = None
 
 
 def left_out_of_slice(views: int, population: int | None) -> list[str]:
@@ -69,10 +65,9 @@ def slice_record(found: Found, objective: SceneObjective, notes: list[str], made
         )
         for direction, slope, curvature, length in zip(found.directions, *numbers, strict=True)
     ]
-    if found.left_out is not None:
-        for direction, curvatures in zip(directions, found.left_out.curvatures.T, strict=True):
-            direction.views_error = sampling_error(curvatures, found.left_out.population)
-    population = found.left_out and found.left_out.population
+    if found.population is not None and found.by_view is not None:
+        for direction, curvatures in zip(directions, found.by_view.T, strict=True):
+            direction.views_error = sampling_error(curvatures, found.population)
     about = {"directions": directions, "loss_scale": found.loss_scale, "cosine": found.cosine, **grid.record()}
     evaluations = grid.evaluations + (0 if probe is None else probe.evaluations)
     return SliceRecord(
@@ -80,9 +75,9 @@ def slice_record(found: Found, objective: SceneObjective, notes: list[str], made
         slice=convert(about, schema.Slice),
         finite_probe=None if probe is None else convert(probe.record(), schema.FiniteProbe),
         counts=counts_of(
-            objective.counts, population, products=found.matvecs, renders=evaluations * objective.counts.views
+            objective.counts, found.population, products=found.matvecs, renders=evaluations * objective.counts.views
         ),
-        notes=notes + left_out_of_slice(objective.counts.views, population),
+        notes=notes + left_out_of_slice(objective.counts.views, found.population),
         provenance=made,
         timing={},
     )

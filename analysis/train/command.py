@@ -50,7 +50,7 @@ from splat.model.typed import leaves, typed
 from splat.model.untrusted import beside, locked, replacing
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
-from splat.scenes.splits import Split, read_names, split_scene, usual_views
+from splat.scenes.splits import Split, explicit_split, read_names, split_scene, usual_views
 from splat.scenes.view import View
 from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
 from splat.training.densify import DensifySettings
@@ -222,7 +222,7 @@ def _split(options: TrainOptions, scene: Scene) -> Split:
     if options.train_list is not None:
         if options.views is not None:
             raise InputError("expected --views or --train-list, got both; leave one out")
-        return split_scene(scene, train=read_names(options.train_list))
+        return explicit_split(scene.names, read_names(options.train_list))
     views = usual_views(scene) if options.views is None else options.views
     return split_scene(scene, None if views == "all" else views)
 

@@ -12,7 +12,7 @@ DTU        3, 6 or 9 views, the first of 25, 22, 28, 40, 44, 48, 0, 8, 13 (views
 Blender    training views r_26, r_86, r_2, r_55, r_75, r_93, r_16, r_73, the first n of them; every 8th test view,
            25 of 200: DietNeRF, FreeNeRF.  A folder already reduced to these images gives the same split
 named      a transforms.json that lists its training views (train_filenames): all of them, or n at equal steps
-explicit   training (and test) views by name or by number
+explicit   training (and test) views by name
 """
 
 import re
@@ -55,29 +55,14 @@ def usual_views(scene: Scene) -> int:
     return sum(frame.subset == "train" for frame in scene.frames) or FEWEST
 
 
-def split_scene(
-    scene: Scene,
-    views: int | None = None,
-    train: Sequence[str | int] | None = None,
-    test: Sequence[str | int] | None = None,
-) -> Split:
-    """The protocol of the scene's kind with that many training views (all by default), or the explicit lists.
-
-    InputError where the scene lacks views.
+def split_scene(scene: Scene, views: int | None = None) -> Split:
+    """The protocol of the scene's kind with that many training views (all by default).  InputError where it lacks views.
 
     >>> from splat import SyntheticSettings, synthetic_scene
     >>> scene = synthetic_scene(SyntheticSettings(gaussians=50, views=10, width=16, height=12)).scene
     >>> split_scene(scene, 2).train
     ('images/view_001.png', 'images/view_009.png')
     """
-    if train is not None:
-        if views is not None:
-            raise InputError(
-                f"expected a number of views or a list of training views, got both: {views} and {list(train)}"
-            )
-        return explicit_split(scene.names, train, test)
-    if test is not None:
-        raise InputError("expected a list of training views beside the list of test views, got none; give both")
     if scene.kind == "blender":
         return blender_split(scene.frames, views)
     if any(frame.subset for frame in scene.frames):
@@ -177,8 +162,8 @@ def _middle(centres: Float[Tensor, "n 3"], members: Bool[Tensor, " n"]) -> int:
     return int(distances.masked_fill(~members, float("inf")).argmin())
 
 
-def explicit_split(names: Sequence[str], train: Sequence[str | int], test: Sequence[str | int] | None = None) -> Split:
-    """Split with these training views; `test`, else all others, are held out.  A view is a name, its last part, or a number."""
+def explicit_split(names: Sequence[str], train: Sequence[str], test: Sequence[str] | None = None) -> Split:
+    """Split with these training views; `test`, else all others, are held out.  A view is a name or its last part."""
     chosen = tuple(_resolve(names, key) for key in train)
     if not chosen or len(set(chosen)) < len(chosen):
         raise InputError(f"expected training views, each once, got {list(train)}")
@@ -203,11 +188,7 @@ def read_names(path: Path) -> tuple[str, ...]:
     return names
 
 
-def _resolve(names: Sequence[str], key: str | int) -> str:
-    if isinstance(key, int):
-        if not 0 <= key < len(names):
-            raise InputError(f"expected the number of a view from 0 to {len(names) - 1}, got {key}")
-        return names[key]
+def _resolve(names: Sequence[str], key: str) -> str:
     if key in names:
         return key
     matches = [

@@ -77,7 +77,6 @@ def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environ
     environment.filters |= {
         "quantity": quantity,
         "cell": _cell,
-        "setting": _setting,
         "capitalise": lambda words: words[:1].upper() + words[1:],
     }
     return environment
@@ -335,14 +334,6 @@ def shown_numbers(record: Record[ProbeRecord]) -> dict[str, str]:
         plane = f"over the plane of {names}: from {extent}, at the centre {quantity(data.slice.center_loss)}."
         found |= {"slice2d": f"Contours of the loss {plane}", "surface": f"Surface of the loss {plane}"}
     return found
-
-
-def _setting(value: Any, name: str) -> str:
-    """A value in the tables of counts and provenance, with its unit."""
-    if name == "max_seconds" and value in ("Infinity", math.inf):
-        return "no limit"
-    unit = {"memory": " GiB", "max_seconds": " s"}.get(name, "")
-    return _cell(value) + (unit if isinstance(value, int | float) else "")
 
 
 def _cell(value: Any) -> str:

@@ -6,7 +6,8 @@ is shown was rendered; `landscape slice --radius` renders farther.
 """
 
 import math
-from collections.abc import Sequence
+from argparse import ArgumentParser
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +23,8 @@ from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import ProbeRecord, Record, SliceRecord, read_record
 from analysis.records.run_files import CHECKPOINT
 from figures.plane import Plane, plane
-from figures.style import BLACK, FIELD_MAP, MISSING, literal
+from figures.scripts import add_paper, print_files
+from figures.style import BLACK, FIELD_MAP, MISSING, literal, save
 from landscape.errors import InputError
 
 START = "start"
@@ -213,3 +215,15 @@ def section(axes: Axes, landscape: Plane, scale: Scale, axis: int, **look: objec
     axes.set(xlim=(-reach, reach), ylim=(scale.low / loss, scale.high / loss))
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.grid(True)
+
+
+def runs_script(draw: Callable[[Sequence[Path]], Figure], name: str) -> int:
+    """Draw two runs into a file."""
+    parser = ArgumentParser(description=f"Draw {name} from the records of two runs.")
+    parser.add_argument(
+        "runs", type=Path, nargs=2, metavar="RUN", help="folders of landscape train: 3DGS, then StableGS"
+    )
+    parser.add_argument("--out", type=Path, default=Path(f"{name}.png"), help="PNG, PDF or SVG, by its suffix")
+    options = add_paper(parser).parse_args()
+    out = options.out.with_suffix(f".{options.format}") if options.format else options.out
+    return print_files(lambda: [save(draw(options.runs), out)])

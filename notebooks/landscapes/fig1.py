@@ -1,9 +1,9 @@
 """Figure after the paper's Fig. 1: two landscapes side by side, and what the two scenes look like from a view held out.
 
-`python -m figures.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint along the two
-steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1, e_2), under the largest
+`python -m notebooks.landscapes.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint
+along the two steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1, e_2), under the largest
 eigenvalue and over that of the first run; below, the photograph of the first view that both have rendered, and
-both renders with their PSNR.  Both share their axes (`figures.manifold`).
+both renders with their PSNR.  Both share their axes (`notebooks.landscapes.manifold`).
 """
 
 from collections.abc import Sequence
@@ -19,12 +19,19 @@ from matplotlib.ticker import MaxNLocator
 from analysis.console.failures import program
 from analysis.records.quantities import rough
 from analysis.records.run_files import METRICS, read_scores
-from figures.fig7 import names_of, read_all
-from figures.manifold import Scale, contours, landscape_of, require_same_function, section, surface
 from figures.plane import Plane
-from figures.scripts import runs_script
 from figures.style import BLUE, VERMILION, literal, new_figure, style
 from landscape.errors import InputError
+from notebooks.landscapes.fig7 import names_of, read_all
+from notebooks.landscapes.manifold import (
+    Scale,
+    contours,
+    landscape_of,
+    require_same_function,
+    runs_script,
+    section,
+    surface,
+)
 
 RENDERS, PANELS = "test", "panels"
 WIDTH = 4.8  # inches
