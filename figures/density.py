@@ -5,7 +5,7 @@ start vectors' quadratures, each node a Gaussian of width sigma = BROADENING of 
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,9 @@ from matplotlib.ticker import NullLocator
 
 from analysis.records.quantities import exponent_of, power_of_ten, quantity, unit_suffix
 from figures.style import BLUE, VERMILION, new_figure, style
-from landscape.spectrum.density import SpectralDensity
+
+if TYPE_CHECKING:
+    from landscape.spectrum.rules import SpectralDensity  # slow: with torch
 
 BROADENING = 0.01
 POINTS = 2000
@@ -23,7 +25,7 @@ DECADES = 8  # below the highest point
 ROOM = (5.0, 3.4, 1.6)  # decades above it: of words on the ends and the broadening
 
 
-def draw_density(density: SpectralDensity) -> Figure:
+def draw_density(density: "SpectralDensity") -> Figure:
     """Density over curvature, logarithmic."""
     with style():
         figure = new_figure(2.2)
