@@ -166,9 +166,9 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
         _show(axes["minus"], maps["minus"], f"A step of {step} back: loss {back}")
         _show(axes["plus"], maps["plus"], f"A step of {step} forth: loss {forth}")
         show_scaled(axes["difference"], maps["difference"], end.difference, "Forth less back", end.difference.unit)
-        for name, shift in (("view", (0, 0)), ("photograph", (left, top))):
+        for picture, shift in ((axes["view"], (0, 0)), (axes["photograph"], (left, top))):
             for carrier in reversed(end.carriers):  # the first above the others
-                axes[name].add_patch(_outline(carrier, shift, _colour(carrier, end)))
+                picture.add_patch(_outline(carrier, shift, _colour(carrier, end)))
         for line, carrier in enumerate(end.carriers):
             axes["photograph"].text(
                 0.03, 0.95 - 0.12 * line, f"{carrier.gaussian:,}: {percent(carrier.share)}",

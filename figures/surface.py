@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 from mpl_toolkits.mplot3d import Axes3D
 
 from analysis.console.failures import program
@@ -52,7 +52,7 @@ def draw(record: Record) -> Figure:
         axes.set_ylabel(field.y.short_label, labelpad=-6)
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_locator(MaxNLocator(4))
-        axes.set_zticks([])  # the bar of the colours says heights
+        axes.zaxis.set_major_locator(NullLocator())  # the bar of the colours says heights
         axes.tick_params(labelsize=6, pad=-3)
         axes.set_proj_type("ortho")
         axes.view_init(elev=50, azim=-58)  # so steep that no wall hides the centre
