@@ -1,9 +1,9 @@
 """Figure after the paper's Fig. 1: two landscapes side by side, and what the two scenes look like from a view held out.
 
 `python -m notebooks.landscapes.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint
-along the two steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1, e_2), under the largest
-eigenvalue and over that of the first run; below, the photograph of the first view that both have rendered, and
-both renders with their PSNR.  Both share their axes (`notebooks.landscapes.manifold`).
+along the two steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1, e_2), under the
+largest eigenvalue and over that of the first run; below, the photograph of the first view that both have rendered, and
+both renders with their PSNR.  Both share their axes (`manifold`).
 """
 
 from collections.abc import Sequence

@@ -3,8 +3,8 @@
 `python -m notebooks.landscapes.fig7 RUN_3DGS RUN_STABLEGS --out fig7.png`.  Above: |lambda_max / lambda_min| (Eq. (3); open:
 negative) with its bracket, and the loss around both checkpoints along the two steepest eigenvectors.  Below: the same around
 the start of the first run, and sections through all three along e_1 and e_2.  All axes are those of the two ends (`manifold`),
-but for the start's surface, whose title says how much farther it reaches (a start may be hundreds of times wider than an end), and the
-sections' losses, which hold the start's too: a slope is not cut off where it falls below its centre.
+but for the start's surface, whose title says how much farther it reaches (a start may be hundreds of times wider than an end),
+and the sections' losses, which hold the start's too: a slope is not cut off where it falls below its centre.
 """
 
 from collections.abc import Callable, Sequence
