@@ -19,7 +19,7 @@ from splat.training.state import Training
 from tests.splat.gpu.interpreted import emulate
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, two_views
 from tests.splat.random_scenes import MODES, filtered, random_gaussians, random_like
-from tests.splat.tiny import EXTENT, ended, tiny_config, tiny_gaussians, tiny_views
+from tests.splat.tiny import EXTENT, ended, tiny_config, tiny_gaussians
 from tests.splat.tolerances import DERIVATIVE, errors_by_block, relative_error
 
 LOSS = LossSettings("charbonnier")
@@ -42,8 +42,8 @@ def scene(dtype: torch.dtype) -> Gaussians:
 
 
 def views() -> list[View]:
-    """Of two tiles each."""
-    return two_views(18, 12)
+    """Of two tiles each; the loss has one program, as those of more are in `test_loss.py`."""
+    return two_views(17, 5)
 
 
 def on(gaussians: Gaussians, device: torch.device) -> Gaussians:
@@ -70,7 +70,7 @@ def test_gradient_and_products_of_a_view_on_the_gpu_are_those_of_the_specificati
 
 def test_all_that_a_view_on_the_gpu_gives_is_what_one_on_the_cpu_gives(device, monkeypatch):
     view, gaussians = views()[0], scene(torch.float64)
-    U, G = random_like((gaussians.flat.numel(), 2), 2), random_like((2, 4, 12, 18), 3)
+    U, G = random_like((gaussians.flat.numel(), 2), 2), random_like((2, 4, 5, 17), 3)
 
     def everything(gaussians: Gaussians) -> list[Tensor]:
         loss = backend_of(gaussians.flat).view_loss(view.image, LOSS, gaussians.flat)
@@ -106,7 +106,7 @@ def test_the_hessian_of_a_scene_on_the_gpu_is_that_on_the_cpu(device, monkeypatc
 
 def test_images_on_the_gpu_are_twice_differentiable(gpu):
     view, gaussians = views()[0], scene(torch.float64)
-    weight = random_like((3, 12, 18), 4)
+    weight = random_like((3, 5, 17), 4)
     found = []
     cases: list[tuple[Backend, Gaussians]] = [("reference", gaussians), ("kernels", on(gaussians, gpu))]
     for backend, at in cases:
@@ -122,10 +122,10 @@ def test_images_on_the_gpu_are_twice_differentiable(gpu):
 
 def test_a_training_on_the_gpu_takes_the_steps_of_one_on_the_cpu(device, monkeypatch):
     expected, found = (Training.start(tiny_gaussians(dtype=torch.float64), EXTENT, tiny_config(3)) for _ in range(2))
-    ended(expected, tiny_views(torch.float64))
+    ended(expected, views())
     emulate(monkeypatch, device.type == "cpu")
     found.move(device)
-    ended(found, tiny_views(torch.float64))
+    ended(found, views())
     assert len(found.gaussians) == len(expected.gaussians) and found.adam.updates == expected.adam.updates == 3
     # Adam divides by the gradient's own size, so that what is next to 0 keeps few digits
     assert relative_error(found.gaussians.flat.cpu(), expected.gaussians.flat) < 1e-9
