@@ -2,13 +2,12 @@
 
 import time
 from collections.abc import Callable
-from subprocess import Popen
 from typing import Any
 
 PATIENCE = 1200.0  # seconds: the kernels take four minutes of a processor to compile, of which others may leave a fifth
 
 
-def waits_for(ready: Callable[[], object], process: Popen[Any] | None = None) -> None:
+def waits_for(ready: Callable[[], object], process: Any = None) -> None:
     """Return as soon as something is so; a process that would have made it so must not have ended before."""
     end = time.monotonic() + PATIENCE
     while not ready():

@@ -9,7 +9,6 @@ than at its start, and that the system ends where a case takes too long.  Outcom
 """
 
 import argparse
-import multiprocessing
 import os
 import random
 import re
@@ -22,12 +21,8 @@ import traceback
 import warnings
 from collections import Counter
 from dataclasses import dataclass, field
-from functools import cache
 from importlib.util import find_spec
-from multiprocessing.context import ForkServerContext
-from multiprocessing.forkserver import ensure_running
 from pathlib import Path
-from unittest.mock import patch
 
 SECONDS, MOST_BYTES = 5, 2**30  # of a processor; beyond what the process holds at its start
 PATIENCE = 3600.0  # seconds by the clock for all cases of a process, which may wait for something
@@ -51,10 +46,12 @@ class Found:
 
 def fuzzed(name: str, cases: int, seed: int = 0) -> Found:
     """What comes of so many cases of a reader: as many processes as it takes to come to the last."""
+    from tests.forks import processes  # needs pytest, and `main` says so
+
     found, first = Found(), 0
     while first < cases:
         with tempfile.NamedTemporaryFile() as told:
-            process = _processes().Process(target=work, args=(name, range(first, cases), seed, told.name))
+            process = processes().Process(target=work, args=(name, range(first, cases), seed, told.name))
             process.start()
             process.join(PATIENCE)
             process.kill()
@@ -69,16 +66,6 @@ def fuzzed(name: str, cases: int, seed: int = 0) -> Found:
             found.add(first, "ended", f"exit code {process.exitcode}: {said[-300:]}")
             first += 1
     return found
-
-
-@cache
-def _processes() -> ForkServerContext:
-    """Makes processes that have everything imported, and one thread each."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.hostile.readers"])
-    with patch.dict(os.environ, {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}):
-        ensure_running()
-    return context
 
 
 def work(name: str, cases: range, seed: int, told: str) -> None:

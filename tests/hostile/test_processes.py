@@ -18,6 +18,7 @@ from analysis.commands.cli import main
 from landscape.errors import InputError
 from splat.model.untrusted import beside, locked
 from splat.training.checkpoint import load_checkpoint
+from tests.forks import Program
 from tests.waiting import PATIENCE, waits_for
 
 ROOT = Path(__file__).parents[2]
@@ -38,8 +39,14 @@ def run(scene) -> Path:
 
 
 def started(words: list[str], command: Sequence[str] = COMMAND, **settings) -> subprocess.Popen[str]:
+    """A program that Python begins."""
     pipe = subprocess.PIPE
     return subprocess.Popen([*command, *words], cwd=ROOT, stdout=pipe, stderr=pipe, text=True, **settings)
+
+
+def forked(words: list[str], **settings) -> Program:
+    """A command that has its libraries imported as it begins."""
+    return Program([*COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **settings)
 
 
 def stepped(run: Path) -> bool:
@@ -54,7 +61,8 @@ def hidden(folder: Path) -> list[str]:
 @pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_training_that_a_signal_ends_saves_and_says_how_to_continue(scene, tmp_path, kind):
     out = tmp_path / "x[v2]"
-    process = started(["train", str(scene), "--out", str(out), *LONG])
+    begin = started if kind == signal.SIGTERM else forked
+    process = begin(["train", str(scene), "--out", str(out), *LONG])
     waits_for(lambda: stepped(out), process)
     process.send_signal(kind)
     said = process.communicate(timeout=PATIENCE)[1]
@@ -63,18 +71,18 @@ def test_a_training_that_a_signal_ends_saves_and_says_how_to_continue(scene, tmp
     assert load_checkpoint(out / "checkpoint.pt").training.step > 0 and hidden(tmp_path) == hidden(out) == []
 
 
-@pytest.mark.parametrize("words", [["probe"], ["slice", "--points", "31", "--all-points"]])
+@pytest.mark.parametrize("words", [["probe", "--quick"], ["slice", "--points", "31", "--all-points"]])
 def test_what_a_signal_ends_keeps_what_it_found_and_goes_on_from_there(run, tmp_path, words):
     out = tmp_path / "record"
     command = [words[0], str(run / "checkpoint.pt"), "--out", str(out), *words[1:]]
-    process = started(command)
+    process = forked(command)
     waits_for(lambda: any((tmp_path / ".record.unfinished").rglob("[!.]*.[mn]*")), process)
     process.terminate()
     said = process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == 143 and said.endswith("landscape: interrupted by SIGTERM\n"), said
     assert "Aborted at" not in said and "Traceback" not in said and shlex.join(command) in said
     assert [path.name for path in tmp_path.iterdir()] == [".record.unfinished"]
-    again = started(command)
+    again = forked(command)
     said = again.communicate(timeout=PATIENCE)[1]
     assert again.returncode == 0 and (words[0] == "slice" or "kept from before" in said), said
     assert [path.name for path in tmp_path.iterdir()] == ["record"]
@@ -120,9 +128,9 @@ def test_a_second_command_on_a_folder_is_refused_and_a_killed_one_holds_nothing(
 
 def test_of_two_trainings_in_one_folder_one_is_refused_in_a_sentence(scene, tmp_path):
     out = tmp_path / "run"
-    first = started(["train", str(scene), "--out", str(out), *LONG])
+    first = forked(["train", str(scene), "--out", str(out), *LONG])
     waits_for(lambda: stepped(out), first)
-    second = started(["train", str(scene), "--out", str(out), *LONG, "--resume"])
+    second = forked(["train", str(scene), "--out", str(out), *LONG, "--resume"])
     said = second.communicate(timeout=PATIENCE)[1]
     assert second.returncode == 2 and "no other training" in said and said.count("landscape:") == 1
     first.terminate()
@@ -147,12 +155,12 @@ def limited(size: int) -> Callable[[], None]:
 
 
 def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_path):
-    done = started(["train", str(scene), "--out", str(tmp_path / "new")], preexec_fn=limited(4096))
+    done = forked(["train", str(scene), "--out", str(tmp_path / "new")], limit=4096)
     said = done.communicate(timeout=PATIENCE)[1]
     assert done.returncode == 74 and str(tmp_path) in said and "Traceback" not in said, said
     quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
     assert main([*quick, str(run / "first")]) == 0  # compiles what is not yet
-    done = started([*quick, str(tmp_path / "probe")], preexec_fn=limited(8192))
+    done = forked([*quick, str(tmp_path / "probe")], limit=8192)
     said = done.communicate(timeout=PATIENCE)[1]
     assert done.returncode == 74 and str(tmp_path / ".probe.unfinished/") in said and "Traceback" not in said, said
     assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]  # from where it goes on
@@ -194,7 +202,7 @@ def test_two_compile_a_kernel_at_once_and_a_cut_file_is_compiled_anew(tmp_path):
         assert begun().communicate(timeout=PATIENCE) == ("8.0\n", "")
 
 
-@pytest.mark.parametrize("words", [["train", "--help"], ["train", "nowhere"]])
+@pytest.mark.parametrize("words", [["train", "--help"], ["trajectory", "nowhere"]])
 def test_output_that_nobody_reads_is_no_error(words):
     command = " ".join([*COMMAND, *words])
     for pipe in ("| true; exit ${PIPESTATUS[0]}", ">&-"):

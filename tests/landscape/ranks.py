@@ -1,4 +1,4 @@
-"""Runs a function on gloo ranks, each a process of its own, that meet at a file."""
+"""Runs a function on gloo ranks, each a process of its own, a fork, that meet at a file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,16 +6,18 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch.multiprocessing.spawn import spawn
+from torch.multiprocessing.spawn import start_processes
 
 from landscape.operators.distributed import Ranks
+from tests.forks import processes
 
 Findings = dict[str, Any]
 
 
 def on_ranks(size: int, folder: Path, work: Callable[[Ranks], Findings]) -> list[Findings]:
     """What work(ranks) returned on every rank."""
-    spawn(_process, (size, str(folder), work), nprocs=size)
+    processes()
+    start_processes(_process, (size, str(folder), work), nprocs=size, start_method="forkserver")
     return [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(size)]
 
 

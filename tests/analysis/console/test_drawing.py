@@ -1,6 +1,7 @@
 """Pictures drawn by other processes."""
 
 import ast
+import subprocess
 from pathlib import Path
 from time import monotonic
 
@@ -15,6 +16,11 @@ STUCK = f"""
 import subprocess, sys
 subprocess.run([sys.executable, "-c", "import time; print('asleep', file=open('asleep', 'w')); time.sleep({PATIENCE})"])
 """
+
+
+@pytest.fixture(autouse=True)
+def programs(monkeypatch) -> None:
+    monkeypatch.setattr("analysis.console.drawing.subprocess", subprocess)
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import threading
 from dataclasses import replace
@@ -32,10 +31,10 @@ from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
 from splat.training.origin.fingerprint import FORMULAS
 from tests import recorded
+from tests.forks import Program, stand_in
 from tests.recorded import synthetic
 from tests.waiting import PATIENCE, waits_for
 
-ROOT = Path(__file__).parents[4]
 FILE = """
 out = "out"
 iterations = 6
@@ -194,9 +193,11 @@ def test_no_cell_starts_where_one_cannot(folder, no_commands, capsys, old, new, 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_what_stops_a_sweep_stops_its_cells_after_they_have_saved(folder, tmp_path, capsys, number):
+def test_what_stops_a_sweep_stops_its_cells_after_they_have_saved(folder, tmp_path, capsys, monkeypatch, number):
     if number == signal.SIGTERM:  # as under nohup, for the sweep and for its cells
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    else:
+        stand_in(monkeypatch)
     before = signal.getsignal(signal.SIGINT)
     run = tmp_path / "still/3dgs/1"
     thread = when((run / "seconds.json").exists, lambda: os.kill(os.getpid(), number))
@@ -299,8 +300,8 @@ def test_two_sweeps_share_the_cells_and_the_last_writes_all(folder, tmp_path, mo
         run(cells)
 
     monkeypatch.setattr(_Cells, "run", waits)
-    command = [sys.executable, "-m", "analysis.commands.cli", *words]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as first:
+    stand_in(monkeypatch)
+    with Program([sys.executable, "-m", "analysis.commands.cli", *words]) as first:
         codes = {main(words), first.wait(timeout=PATIENCE)}
     assert codes <= {0, CELLS_ELSEWHERE} and 0 in codes
     rows = pd.read_csv(tmp_path / "results.csv")

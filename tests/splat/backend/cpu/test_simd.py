@@ -164,7 +164,7 @@ def test_the_same_holds_at_another_width(bits):
     files = [__file__]
     if bits == OTHERS[0]:  # the kernels take a while to compile
         files.append(str(Path(__file__).parents[2] / "render" / "cpu" / KERNEL))
-    command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *files]
+    command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "--noconftest", *files]
     done = subprocess.run(command, env={**os.environ, "LANDSCAPE_VECTOR_BITS": bits}, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
 
