@@ -29,6 +29,7 @@ from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
 from splat.training.state import Training
+from tests.forks import stand_in
 from tests.splat.tiny import EXTENT, SMOOTH, ended, tiny_config, tiny_gaussians, tiny_views
 
 DOUBLE = torch.float64
@@ -228,6 +229,7 @@ def test_the_table_has_each_row_once_and_is_continued(tmp_path, monkeypatch):
     write_transforms_scene(made.scene, tmp_path / "still")
     (tmp_path / "sweep.toml").write_text(SWEEP)
     runs, out = tmp_path / "runs", tmp_path / "table.csv"
+    stand_in(monkeypatch)
     assert main(["sweep", str(tmp_path / "sweep.toml"), "--out", str(runs), "--jobs", "1", "--only", "still/a/0"]) == 0
     monkeypatch.setattr(command, "LEVELS", (1.0, 99.0))
     measured, paths = command.measured_row, []

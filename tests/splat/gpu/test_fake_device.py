@@ -99,7 +99,7 @@ def test_products_of_a_scene_stay_on_the_device_and_do_not_wait(monkeypatch):
     emulate(monkeypatch)
     with fake:
         flat = fake.on_gpu(gaussians.flat)
-        views = two_views(16, 12)[:1]
+        views = two_views(16, 5)[:1]
         objective = SceneObjective(gaussians.with_flat(flat), views, LossSettings(), BACKGROUND, memory=2**30)
         hessian = SceneHessian(objective)
         V = fake.on_gpu(random_like((hessian.dim, 2), 1))
