@@ -30,7 +30,7 @@ from analysis.records.run_files import COMPARISON, Comparison
 from analysis.runs.compare_table import Row, Run, compare_table, comparison, frame
 from analysis.runs.compared import checkpoint_path, compared, probe, probe_command, probe_folder, probed, scores_of
 from analysis.runs.options import CompareOptions
-from analysis.runs.seeds import Group, grouped, groups_of, identical, sayings
+from analysis.runs.seeds import SPREAD, Group, grouped, groups_of, headings, identical, sayings
 from landscape.errors import InputError
 from splat.training.checkpoint import write_atomically
 from splat.training.origin.fingerprint import changes, in_short
@@ -158,9 +158,9 @@ def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
     lines += _once(said)
     if without := [run for run in runs if not run.data.split_control]:
         lines.append(
-            "Anisotropy depends on the number of Gaussians; how much, the split control says, which is missing: "
-            + "; ".join(
-                f"landscape probe {shlex.quote(str(checkpoint_path(run.folder)))} --split-control" for run in without
+            "Anisotropy depends on the number of Gaussians; how much, the split control says, which is missing:"
+            + "".join(
+                f"\n  landscape probe {shlex.quote(str(checkpoint_path(run.folder)))} --split-control" for run in without
             )
         )
     return lines
@@ -244,30 +244,32 @@ def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], fo
     for name in PICTURES:  # of an earlier comparison, which may show what this one has no numbers for
         (out / f"{name}.png").unlink(missing_ok=True)
     notes += draw("compare", out)
-    names = [group.label for group in groups]
-    write_atomically(out / PAGE, render_page(runs, names, shown, says, notes, out).encode(errors="backslashreplace"))
+    write_atomically(out / PAGE, render_page(runs, groups, shown, says, notes, out).encode(errors="backslashreplace"))
     say(*says, console=console)
-    console.print(compare_table(shown, names))
+    console.print(compare_table(shown, headings(groups)))
+    say(*[SPREAD] * (len(groups) < len(runs)), console=console)
     say(*notes, style="yellow", console=console)
     say(f"open {out / PAGE}; numbers: {out / TABLE}", console=console)
 
 
 def render_page(
     runs: Sequence[Run],
-    groups: Sequence[str],
+    groups: Sequence[Group],
     rows: Sequence[Row],
     says: Sequence[str],
     notes: Sequence[str],
     out: Path,
 ) -> str:
-    """The page as text, with the pictures that lie in the folder.  groups: names of the rows' columns."""
+    """The page as text, with the pictures that lie in the folder.  groups: of the rows' columns."""
     environment = template_environment()
     sections = {
         name: [row for row in rows if row.section == name] for name in dict.fromkeys(row.section for row in rows)
     }
     return environment.get_template("compare.html.jinja").render(
         runs=runs,
-        groups=groups,
+        headings=headings(groups),
+        spread=SPREAD if len(groups) < len(runs) else "",
+        alone=any(len(group.folders) == 1 for group in groups),
         says=says,
         sections=sections,
         notes=notes,

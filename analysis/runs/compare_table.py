@@ -25,6 +25,7 @@ from splat.training.state import MethodSettings
 
 FAMILIES = "per_attribute"  # a section that only the page and the file show
 DEPTH = "depth over lateral"
+CONFIRMED = {True: "confirmed by renders", False: "not confirmed by renders"}
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ def _trace(trace: Trace | None) -> Entry:
 
 def _end(end: Eigenvalue) -> Entry:
     value, residual = end.value, end.residual
-    cell = Cell(measured(value, residual), "not confirmed by renders" if end.doubted else "", end.reason or "")
+    cell = Cell(measured(value, residual), CONFIRMED[not end.doubted] if end.renders else "", end.reason or "")
     if value is None or residual is None:
         return Entry(value, cell)
     return Entry(value, cell, value - residual, value + residual)

@@ -2,25 +2,30 @@
 
 spread      standard deviation over the runs of a group, with n - 1; unknown for one run
 apart       two groups of two runs or more are in a quantity where their means differ by more than two standard deviations of
-            a difference of two single runs, 2 sqrt(s^2 + t^2)
+            a difference of two single runs, 2 sqrt(s^2 + t^2).  Of normal quantities with equal means and any spreads, chance
+            makes at most P(|T| > 2 sqrt n) of them so, T Student's with n - 1 degrees of freedom, n the smaller number of runs
+            (Mickey and Brown, Annals of Mathematical Statistics 37, 1966)
 """
 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, sqrt
+from math import ceil, isfinite, sqrt
 from pathlib import Path
 from statistics import mean, stdev
 
-from analysis.records.quantities import measured, quantity
+from scipy.special import stdtr
+
+from analysis.records.quantities import PLUS_MINUS, measured, quantity
 from analysis.records.run_files import CHECKPOINT
 from analysis.records.tables import Cell
-from analysis.runs.compare_table import Entry, Row
+from analysis.runs.compare_table import CONFIRMED, Entry, Row
 from splat.training.origin.subject import Checkpoint
 
 TOLD = ("held-out views", "trace", "spectrum", "anisotropy")  # sections whose differences are told
 MORE = {"top mass": 1, "participation ratio": -1}  # the sign of an index where curvature is less even
 SPREADS = 2.0
+SPREAD = "Behind ± of n runs stands the standard deviation over them; without ±, it is below half of the last digit."
 EQUAL = 1.1  # largest ratio of numbers of Gaussians that count as the same
 
 
@@ -41,6 +46,17 @@ def groups_of(runs: Sequence[Path]) -> list[Group]:
         )
         groups.append(Group(str(path), tuple(seeds or [path])))
     return groups
+
+
+def headings(groups: Sequence[Group]) -> list[str]:
+    """The groups' labels; with the numbers of runs, where any has several.
+
+    >>> one, two = Group("a", (Path("a"),)), Group("b", (Path("b/0"), Path("b/1")))
+    >>> headings([one]), headings([one, two])
+    (['a'], ['a (n = 1)', 'b (n = 2)'])
+    """
+    several = any(len(group.folders) > 1 for group in groups)
+    return [f"{group.label} (n = {len(group.folders)})" if several else group.label for group in groups]
 
 
 def identical(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> list[str]:
@@ -78,10 +94,15 @@ def _together(entries: Sequence[Entry]) -> Entry:
         return first
     numbers = [entry.value for entry in entries if isinstance(entry.value, int | float) and isfinite(entry.value)]
     if not numbers:
-        return Entry(None, Cell("\n".join(dict.fromkeys(entry.cell.value for entry in entries))))
+        return Entry(None, Cell("\n".join(dict.fromkeys(entry.cell.value for entry in entries)), "", first.cell.note))
     spread = stdev(numbers) if len(numbers) > 1 else None
-    part = "" if len(numbers) == len(entries) else f"{len(numbers)} of {len(entries)} runs"
-    cell = Cell(quantity(mean(numbers)) if spread is None else measured(mean(numbers), spread), part)
+    parts = [f"{len(numbers)} of {len(entries)} runs"] * (len(numbers) < len(entries))
+    if rendered := [entry.cell.bracket for entry in entries if entry.cell.bracket in CONFIRMED.values()]:
+        parts.append(f"{CONFIRMED[True]} in {rendered.count(CONFIRMED[True])} of {len(rendered)}")
+    text = quantity(mean(numbers)) if spread is None else measured(mean(numbers), spread)
+    if spread is not None and all(isinstance(number, int) for number in numbers):
+        text = f"{mean(numbers):,.0f}{PLUS_MINUS}{round(spread) or 1:,}"
+    cell = Cell(text, "\n".join(parts))
     ends = (None, None) if spread is None else (mean(numbers) - spread, mean(numbers) + spread)
     return Entry(mean(numbers), cell, *ends)
 
@@ -95,12 +116,13 @@ def sayings(rows: Sequence[Row], groups: Sequence[Group]) -> list[str]:
     for i, group in enumerate(groups[1:], start=1):
         seeds = len(group.folders) > 1 and len(groups[0].folders) > 1
         if seeds:
-            lines.append(_differences(told, i, f"{group.label} and {groups[0].label}"))
+            lines.append(_differences(told, i, [group, groups[0]]))
         lines.append(_verdict(rows, i, group.label, groups[0].label, seeds=seeds))
     return lines
 
 
-def _differences(rows: Sequence[Row], i: int, pair: str) -> str:
+def _differences(rows: Sequence[Row], i: int, pair: Sequence[Group]) -> str:
+    """Which quantities of two groups are apart, which are not, and by which rule; others are not tried."""
     larger, within = [], []
     for row in rows:
         here, there = row.entries[i], row.entries[0]
@@ -110,10 +132,14 @@ def _differences(rows: Sequence[Row], i: int, pair: str) -> str:
             (larger if apart else within).append(
                 f"{name} ({here.cell.value} and {there.cell.value})" if apart else name
             )
-    words = f"{pair} differ by more than the spread of their seeds in {', '.join(larger)}" if larger else (
-        f"{pair} differ in nothing by more than the spread of their seeds"
-    )  # fmt: skip
-    return f"{words}{'; not in ' + ', '.join(within) if larger and within else ''}."
+    labels, counts = " and ".join(group.label for group in pair), [len(group.folders) for group in pair]
+    chance = 2 * stdtr(min(counts) - 1, -SPREADS * sqrt(min(counts)))
+    words = f"{labels} differ by more than the spread of their seeds in {', '.join(larger) or 'nothing'}"
+    return (
+        f"{words}{'; not in ' + ', '.join(within) if within else ''}. These {len(larger + within)} quantities were tried, no "
+        f"others: apart are means with more than 2 √(s² + t²) between them, s and t the standard deviations over n = {counts[0]} "
+        f"and {counts[1]} seeds. Of quantities that do not differ, chance makes up to {ceil(100 * chance)}% look apart."
+    )
 
 
 def _verdict(rows: Sequence[Row], i: int, label: str, first: str, *, seeds: bool) -> str:
@@ -149,7 +175,8 @@ def _uneven(rows: Sequence[Row], i: int) -> str:
     split = [row.entries for row in rows if row.section == "anisotropy" and row.name.startswith(" ")]
     if max(here, there) <= EQUAL * min(here, there) or any(row[i].value and row[0].value for row in split):
         return ""
-    return f"{here:,.0f} Gaussians against {there:,.0f} make an anisotropy of their own, which --split-control would measure"
+    numbers = " and ".join(counts[0][j].cell.value for j in (i, 0))
+    return f"they have {numbers} Gaussians, and their number alone changes the indices: --split-control measures how much"
 
 
 def _apart(here: Entry, there: Entry) -> bool:

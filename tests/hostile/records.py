@@ -68,6 +68,7 @@ def _use_probes(root: Path, chance: Random) -> Read:
     from analysis.records.tables import family_table, probe_table
     from analysis.runs.compare import cautions, render_page
     from analysis.runs.compare_table import Run, compare_table, comparison, frame
+    from analysis.runs.seeds import groups_of
 
     record, other = (read_record(run / "probe", ProbeRecord) for run in (root, root / "other"))
     checkpoint = Checkpoint(Training.start(tiny_gaussians(), EXTENT, tiny_config()), REFERENCE)
@@ -80,7 +81,7 @@ def _use_probes(root: Path, chance: Random) -> Read:
         rows = comparison(runs)
         frame(rows, ["a", "b"]).to_csv(index=False)
         console.print(compare_table(rows, ["a", "b"]))
-    render_page(runs, ["a", "b"], rows, [], cautions(runs), root)
+    render_page(runs, groups_of([Path("a"), Path("b")]), rows, [], cautions(runs), root)
     if chance.random() < 5 * DRAWN:
         report.render_report(record)
     else:  # without the surface, whose program takes the longest to pack

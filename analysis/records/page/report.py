@@ -9,6 +9,7 @@ import gzip
 import html
 import io
 import math
+import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -18,6 +19,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from markupsafe import Markup, escape
 from PIL import Image
 
 from analysis.records.findings import Line, attribute_name, findings, shares_per_trace
@@ -49,6 +51,7 @@ COMPARED = (  # of the traces, where the record has these steps
     "compares; beside the names their traces, each in its own unit."
 )
 PIXEL = "1 px along the ray: a way as long as the one that moves a splat by a pixel where it is across the ray."
+OPTION = re.compile(r"--[a-z][a-z-]*")  # of a command, which a page must not break
 ROOM, SMALLEST = 3.0, 6  # of the part around an outline: in its half length; at least 1 / SMALLEST of the picture
 PACKED = 4  # level of gzip of plotly.js: at the usual 6 it takes twice as long for 4% fewer bytes
 
@@ -77,6 +80,7 @@ def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environ
     environment.filters |= {
         "quantity": quantity,
         "cell": _cell,
+        "coded": lambda text: Markup(OPTION.sub(r"<code>\g<0></code>", str(escape(text)))),
         "capitalise": lambda words: words[:1].upper() + words[1:],
     }
     return environment

@@ -208,6 +208,11 @@ def test_seeds_are_compared_by_mean_and_spread(runs, capsys, no_pictures, tmp_pa
     trace = synthetic(1.0)[0]["traces"]["means"]["value"]
     cell = measured(1.05 * trace, 0.1 * trace / 2**0.5)
     assert cell in said and cell in page and "The pictures show the first run of each group" in said
+    spread, of_one, number = "stands the standard deviation over them", "Behind ± stands one standard error", "sam (n = 2)"
+    assert all(words in page and words in said for words in (spread, number)) and of_one not in page
+    assert main(["compare", *runs, "--out", str(tmp_path / "runs")]) == 0
+    page = (tmp_path / "runs/compare.html").read_text()
+    assert of_one in page and spread not in page and "(n = " not in page and "<th>probe's seed</th>" in page
     table = pd.read_csv(tmp_path / "cells/compare.csv")
     assert set(table["run"]) == {"plain/0", "plain/1", "sam/0", "sam/1"}
     assert json.loads((tmp_path / "cells/compare.json").read_text())["runs"].keys() == {"plain", "sam"}
@@ -320,7 +325,8 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",
     ):
         assert part in said
-        assert part in " ".join((Path(runs[0]).parents[1] / "compare/compare.html").read_text().split())
+        page = (Path(runs[0]).parents[1] / "compare/compare.html").read_text().replace("<code>", "").replace("</code>", "")
+        assert part in " ".join(page.split())
 
 
 def test_what_holds_of_many_runs_is_said_once_and_seeds_may_differ(runs, capsys, no_pictures):

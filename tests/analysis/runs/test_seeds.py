@@ -2,8 +2,11 @@
 
 from pathlib import Path
 
+import numpy as np
+
+from analysis.records.quantities import HARD
 from analysis.records.tables import Cell
-from analysis.runs.compare_table import Entry, Row
+from analysis.runs.compare_table import CONFIRMED, Entry, Row
 from analysis.runs.seeds import Group, grouped, sayings
 
 PAIR = [Group("plain", (Path("a"), Path("b"), Path("c"))), Group("sam", (Path("d"), Path("e"), Path("f")))]
@@ -34,7 +37,29 @@ def test_a_difference_is_told_where_it_is_larger_than_the_spread_of_seeds():
     ]
     (differences, _) = sayings(grouped(rows, PAIR), PAIR)
     assert differences.startswith("sam and plain differ by more than the spread of their seeds in PSNR (dB) (21.1")
-    assert differences.endswith("; not in trace of opacity.")
+    assert "; not in trace of opacity. These 2 quantities were tried, no others" in differences
+    assert differences.endswith("over n = 3 and 3 seeds. Of quantities that do not differ, chance makes up to 8% look apart.")
+
+
+def test_chance_makes_no_more_of_equal_quantities_look_apart_than_is_said():
+    generator = np.random.default_rng(0)
+    for n, m, wider, most in ((2, 2, 1.0, 22), (2, 2, 30.0, 22), (2, 5, 30.0, 22), (3, 3, 30.0, 8)):
+        first, second = wider * generator.normal(size=(20_000, n)), generator.normal(size=(20_000, m))
+        apart = abs(first.mean(axis=1) - second.mean(axis=1))
+        seen = np.mean(apart > 2 * np.sqrt(first.var(axis=1, ddof=1) + second.var(axis=1, ddof=1)))
+        pair = [Group(name, tuple(map(Path, name * size))) for name, size in (("a", n), ("b", m))]
+        told = sayings(grouped([row("trace", "opacity", *map(float, range(n + m)))], pair), pair)[0]
+        assert f"chance makes up to {most}% look apart" in told and 100 * seen < most
+        assert wider == 1 or 100 * seen > 0.9 * most - 1  # nor many more
+
+
+def test_of_a_group_it_is_said_in_how_many_runs_renders_confirm_an_end_and_how_many_gaussians_it_has():
+    cells = [Cell("1", CONFIRMED[True]), Cell("2", CONFIRMED[False]), Cell("3", CONFIRMED[True])]
+    ends = Row("spectrum", "largest eigenvalue", tuple(Entry(float(cell.value), cell) for cell in 2 * cells))
+    counts = Row("run", "Gaussians", tuple(Entry(n, Cell(f"{n:,}")) for n in (7367, 7333, 7350, 9, 9, 10)))
+    found = [row.entries for row in grouped([ends, counts], PAIR)]
+    assert {each.cell.bracket for each in found[0]} == {"confirmed by renders in 2 of 3"}
+    assert [each.cell.value.replace(HARD, " ") for each in found[1]] == ["7,350 ± 17", "9 ± 1"]
 
 
 def steady(section: str, name: str, plain: float, sam: float) -> Row:
@@ -67,11 +92,16 @@ def test_one_training_of_each_decides_nothing():
     )
 
 
+def counts(plain: int, sam: int) -> Row:
+    return Row("run", "Gaussians", tuple(Entry(n, Cell(f"{n:,}")) for n in 3 * [plain] + 3 * [sam]))
+
+
 def test_other_numbers_of_gaussians_decide_nothing_without_a_split_control():
-    rows = [steady("anisotropy", SHARE, 0.1, 0.2), steady("run", "Gaussians", 8000.0, 30000.0)]
+    rows = [steady("anisotropy", SHARE, 0.1, 0.2), counts(8000, 30000)]
     assert said(*rows).endswith(
-        "because 30,000 Gaussians against 8,000 make an anisotropy of their own, which --split-control would measure."
+        "because they have 30,000 and 8,000 Gaussians, and their number alone changes the indices: --split-control measures "
+        "how much."
     )
     control = steady("anisotropy", "  split control", 1.1, 1.2)
     assert said(*rows, control).startswith("sam is the more anisotropic")
-    assert said(rows[0], steady("run", "Gaussians", 8000.0, 8500.0)).startswith("sam is the more anisotropic")
+    assert said(rows[0], counts(8000, 8500)).startswith("sam is the more anisotropic")
