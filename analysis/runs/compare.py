@@ -160,7 +160,8 @@ def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
         lines.append(
             "Anisotropy depends on the number of Gaussians; how much, the split control says, which is missing:"
             + "".join(
-                f"\n  landscape probe {shlex.quote(str(checkpoint_path(run.folder)))} --split-control" for run in without
+                f"\n  landscape probe {shlex.quote(str(checkpoint_path(run.folder)))} --split-control"
+                for run in without
             )
         )
     return lines

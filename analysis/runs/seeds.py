@@ -137,8 +137,9 @@ def _differences(rows: Sequence[Row], i: int, pair: Sequence[Group]) -> str:
     words = f"{labels} differ by more than the spread of their seeds in {', '.join(larger) or 'nothing'}"
     return (
         f"{words}{'; not in ' + ', '.join(within) if within else ''}. These {len(larger + within)} quantities were tried, no "
-        f"others: apart are means with more than 2 √(s² + t²) between them, s and t the standard deviations over n = {counts[0]} "
-        f"and {counts[1]} seeds. Of quantities that do not differ, chance makes up to {ceil(100 * chance)}% look apart."
+        f"others: apart are means with more than 2 √(s² + t²) between them, s and t the standard deviations over n = "
+        f"{counts[0]} and {counts[1]} seeds. Of quantities that do not differ, chance makes up to "
+        f"{ceil(100 * chance)}% look apart."
     )
 
 
@@ -176,7 +177,9 @@ def _uneven(rows: Sequence[Row], i: int) -> str:
     if max(here, there) <= EQUAL * min(here, there) or any(row[i].value and row[0].value for row in split):
         return ""
     numbers = " and ".join(counts[0][j].cell.value for j in (i, 0))
-    return f"they have {numbers} Gaussians, and their number alone changes the indices: --split-control measures how much"
+    return (
+        f"they have {numbers} Gaussians, and their number alone changes the indices: --split-control measures how much"
+    )
 
 
 def _apart(here: Entry, there: Entry) -> bool:

@@ -19,7 +19,6 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from markupsafe import Markup, escape
 from PIL import Image
 
 from analysis.records.findings import Line, attribute_name, findings, shares_per_trace
@@ -80,7 +79,7 @@ def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environ
     environment.filters |= {
         "quantity": quantity,
         "cell": _cell,
-        "coded": lambda text: Markup(OPTION.sub(r"<code>\g<0></code>", str(escape(text)))),
+        "coded": lambda text: OPTION.sub(r"<code>\g<0></code>", html.escape(text)),
         "capitalise": lambda words: words[:1].upper() + words[1:],
     }
     return environment

@@ -208,7 +208,11 @@ def test_seeds_are_compared_by_mean_and_spread(runs, capsys, no_pictures, tmp_pa
     trace = synthetic(1.0)[0]["traces"]["means"]["value"]
     cell = measured(1.05 * trace, 0.1 * trace / 2**0.5)
     assert cell in said and cell in page and "The pictures show the first run of each group" in said
-    spread, of_one, number = "stands the standard deviation over them", "Behind ± stands one standard error", "sam (n = 2)"
+    spread, of_one, number = (
+        "stands the standard deviation over them",
+        "Behind ± stands one standard error",
+        "sam (n = 2)",
+    )
     assert all(words in page and words in said for words in (spread, number)) and of_one not in page
     assert main(["compare", *runs, "--out", str(tmp_path / "runs")]) == 0
     page = (tmp_path / "runs/compare.html").read_text()
@@ -325,7 +329,9 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",
     ):
         assert part in said
-        page = (Path(runs[0]).parents[1] / "compare/compare.html").read_text().replace("<code>", "").replace("</code>", "")
+        page = (
+            (Path(runs[0]).parents[1] / "compare/compare.html").read_text().replace("<code>", "").replace("</code>", "")
+        )
         assert part in " ".join(page.split())
 
 

@@ -38,7 +38,9 @@ def test_a_difference_is_told_where_it_is_larger_than_the_spread_of_seeds():
     (differences, _) = sayings(grouped(rows, PAIR), PAIR)
     assert differences.startswith("sam and plain differ by more than the spread of their seeds in PSNR (dB) (21.1")
     assert "; not in trace of opacity. These 2 quantities were tried, no others" in differences
-    assert differences.endswith("over n = 3 and 3 seeds. Of quantities that do not differ, chance makes up to 8% look apart.")
+    assert differences.endswith(
+        "over n = 3 and 3 seeds. Of quantities that do not differ, chance makes up to 8% look apart."
+    )
 
 
 def test_chance_makes_no_more_of_equal_quantities_look_apart_than_is_said():
