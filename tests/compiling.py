@@ -21,13 +21,13 @@ def compile_each_once() -> None:
     folder: Any = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
     held, compiled = os.open(f"{folder}/compiling", os.O_RDWR | os.O_CREAT), Dispatcher.compile
 
-    def compile_once(self: Any, signature: Any) -> Any:
+    def compile_once(self: Any, sig: Any) -> Any:
         with global_compiler_lock:
             code = self.py_func.__code__
             place = crc32(f"{code.co_filename}:{code.co_firstlineno}".encode())
             lockf(held, LOCK_EX, 1, place)
             try:
-                return compiled(self, signature)
+                return compiled(self, sig)
             finally:
                 lockf(held, LOCK_UN, 1, place)
 

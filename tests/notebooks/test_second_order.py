@@ -11,6 +11,7 @@ from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
 from splat.training.score.evaluate import evaluate
+from tests.forks import stand_in
 
 SWEEP = """
 seeds = [1]
@@ -37,7 +38,9 @@ def runs(tmp_path_factory):
     made = synthetic_scene(SyntheticSettings(gaussians=60, views=3, width=20, height=14))
     write_transforms_scene(made.scene, folder / "still")
     (folder / "sweep.toml").write_text(SWEEP)
-    assert main(["sweep", str(folder / "sweep.toml"), "--out", str(folder / "runs"), "--jobs", "1"]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        stand_in(patch)
+        assert main(["sweep", str(folder / "sweep.toml"), "--out", str(folder / "runs"), "--jobs", "1"]) == 0
     assert curves([str(folder / "runs"), "--out", str(folder / "pictures")]) == 0
     return folder / "runs"
 

@@ -48,7 +48,7 @@ def test_projectors_have_their_ranks_and_leave_nothing_out_that_is_curved(object
 def test_the_indices_of_every_attribute_are_those_of_its_dense_block(objective: SceneObjective, gauss_newton: bool):
     hessian = SceneHessian(objective, gauss_newton=gauss_newton)
     H = hessian.apply(torch.eye(hessian.dim, dtype=torch.float64))
-    runs, misses, spaces = 6, Counter(), active_spaces(objective, hessian.projector)
+    runs, misses, spaces = 4, Counter(), active_spaces(objective, hessian.projector)
     for seed in range(runs):
         for name, part in block_anisotropies(hessian, torch.Generator().manual_seed(seed), active=spaces).items():
             rows = hessian.blocks.get(name, slice(0, hessian.dim))
@@ -59,5 +59,5 @@ def test_the_indices_of_every_attribute_are_those_of_its_dense_block(objective: 
             largest, spread = float(true[-1]) / total, total**2 / float(true.square().sum())
             misses[name, "top_mass"] += not share.low <= largest * (1 + 1e-9) <= share.high * (1 + 2e-9)
             misses[name, "rank"] += not rank.low <= spread * (1 + 1e-9) <= rank.high * (1 + 2e-9)
-    # 95% brackets: four misses of six have a probability of 9e-5
-    assert max(misses.values()) < 4, misses
+    # 95% brackets: three misses of four have a probability of 5e-4
+    assert max(misses.values()) < 3, misses

@@ -144,10 +144,11 @@ def test_dense_scenes_have_unseen_gaussians_and_clamped_channels() -> None:
 def test_the_rank_is_that_of_the_specifications_hessian() -> None:
     gaussians = random_gaussians(4, 2, seed=5, logit=1.0)
     gaussians.quats.div_(gaussians.quats.norm(dim=1, keepdim=True))
-    objective = SceneObjective(gaussians, two_views(), LossSettings("l2"), BACKGROUND)
+    views = two_views(20, 16)
+    objective = SceneObjective(gaussians, views, LossSettings("l2"), BACKGROUND)
     assert len(objective.active) == 4
     eye = torch.eye(gaussians.flat.numel(), dtype=torch.float64)
-    _, H = gradient_and_products(gaussians, two_views(), LossSettings("l2"), eye)
+    _, H = gradient_and_products(gaussians, views, LossSettings("l2"), eye)
     assert SceneHessian(objective).rank == len(spectrum(without_lengths(H, objective))) < 0.6 * len(H)
 
 
