@@ -28,7 +28,7 @@ def test_the_slice_of_a_quadratic_is_its_model():
     assert result.loss.shape == (5, 3) and result.center_loss == 7 and result.evaluations == 16
     assert result.evaluated.all()
     assert result.reason == "exact" and result.interpolation_error == result.share_beyond == 0
-    assert (result.loss - result.model).abs().max() < 1e-13
+    assert result.model is not None and (result.loss - result.model).abs().max() < 1e-13
     assert result.slope is not None and torch.allclose(result.slope, directions.T @ G, rtol=0, atol=1e-14)
     assert result.curvature is not None
     assert torch.allclose(result.curvature, directions.T @ A @ directions, rtol=0, atol=1e-14)
@@ -69,6 +69,7 @@ def test_the_difference_is_what_the_quadratic_misses():
         operator=DenseOperator(torch.ones(1, 1, dtype=torch.float64)),
         settings=ALL,
     )
+    assert result.model is not None
     assert torch.allclose(result.loss - result.model, result.coordinates[0] ** 3 / 6, rtol=0, atol=1e-15)
 
 
