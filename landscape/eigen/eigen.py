@@ -1,7 +1,9 @@
 """Eigenpairs at the two ends of the spectrum.
 
-`extreme_eigenpairs` grows one subspace for both ends by a Lanczos recurrence (`krylov`).  A run ends when the residual of every
-wanted pair is under max(rtol |lambda|, atol) or under the round-off of a matvec, or when the budget is spent.
+`extreme_eigenpairs` grows one subspace for both ends by a Lanczos recurrence (`krylov`).  A run ends when the measured
+residual of every wanted pair is under max(rtol |lambda|, atol) or at the noise of a matvec, when the basis spans the whole
+space, or when matvecs or seconds are spent.  Where the basis spans an invariant subspace, one more step must leave the wanted
+values unchanged.
 
 Davidson's method, preconditioned by diagonal blocks, would take fewer products.  But it can miss an extreme eigenvalue that
 only the entries outside these blocks make, and converge to its neighbour; a Lanczos recurrence finds such ends, too.
@@ -30,12 +32,12 @@ def extreme_eigenpairs(
     start: Float[Tensor, "n *k"] | None = None,
     progress: Progress | None = None,
 ) -> EigenEnds:
-    """The largest and smallest eigenvalues with vectors and residuals; by default one of each, to 0.1%.
+    """The largest and smallest eigenvalues with vectors and residuals; by default one of each, its residual 0.1% of it.
 
     start: a warm start from one or more vectors, such as eigenvectors of an earlier checkpoint.  The first vector of the
     recurrence is then the sum of their directions, scaled to length 1, plus a random vector of length settings.noise; None: a
-    random vector alone.  Progress counts matvecs.  Raises InputError where H has fewer rows than wanted pairs.  An end that is
-    not found within the budget raises nothing: see its `reason` and residuals.
+    random vector alone.  Progress counts matvecs.  Raises InputError where the operator has fewer rows than
+    there are wanted pairs.  An end that is not found within the budget raises nothing: see its `reason` and residuals.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.linspace(-1, 3, 50, dtype=torch.float64)))
@@ -56,17 +58,21 @@ def extreme_eigenpairs(
         ritz = space.ritz()
         if progress:
             progress(space.matvecs, settings.max_matvecs, ritz.state())
+        # room is left for one more step with its noise, and for measuring every pair
         spent = space.matvecs + settings.block + settings.wanted + 2 > settings.max_matvecs
         late = monotonic() > deadline
+        # below the noise of a product no residual is asked for
         goal = Goal(strictness * settings.rtol, max(strictness * settings.atol, space.floor(ritz)))
         complete = space.size == n
-        # with no more values than wanted pairs, the last one may belong to the other end
+        # with no more values than wanted pairs, the last one may belong to the other end; in an invariant subspace a copy of
+        # a wanted value may be missing until the values stand still
         settled = space.size > settings.wanted and not (space.exhausted(ritz, goal) and ritz.moved(before, goal))
-        near, converged = ritz.near(space.seen_noise, goal), complete or (settled and not ritz.open(goal))
+        near = ritz.near(space.seen_noise, goal)  # its noise: the next step measures it
+        converged = complete or (settled and not ritz.open(goal))
         before = ritz.values[ritz.wanted]
         if converged or spent or late:
             ends, more = space.measured(ritz, "time budget" if late else "matvec budget", converged)
             if not more or complete or spent or late:
                 return ends
-            strictness /= 2
+            strictness /= 2  # measured residuals miss what those of the recurrence meet: ask for half of these
         space.make_room(ritz)

@@ -2,13 +2,13 @@
 
     axes        every point: nothing is interpolated along a line, nor along the two sections of a plane
     fill        the points farthest from all that are known: COARSE at first, then 3/4 as many as are known beside the axes
-    hold out    predict all points that are not known, then evaluate as many of them, at random: the bound is the closer to the
-                largest error the more they are.  If the bound of the error that follows is within tolerance * range, the
-                slice is done, with these predictions; else fill again, and the interpolant has the points held out, too
+    hold out    predict all points that are not known, then evaluate max(holdout, number filled) of them, at random: the more
+                they are, the closer the bound is to the largest error.  If the bound is within tolerance * range, the slice is
+                done, with these predictions; else fill again, and the interpolant has the points held out, too
 
-The interpolant that was judged is the one that is taken: with the points held out, which may lie next to an axis, where the
-spline of (f - axes) / (x y) magnifies jumps, it was worse in 95% of the draws on a fern's planes.  A plane whose bound is not
-within the tolerance when a budget ends is not resolved: its points are those that were evaluated.  Decisions are made once a
+A slice keeps the interpolant that was judged.  Fitting it again with the points held out made it worse in 95% of the draws on
+a fern's planes: some lie next to an axis, where the spline of (f - axes) / (x y) magnifies jumps.  A plane whose bound is not
+within the tolerance at max_evaluations is not resolved: its points are those that were evaluated.  Decisions are made once a
 hold-out, so that the result does not depend on the number of workers.
 """
 
@@ -32,10 +32,10 @@ class SliceSettings:
 
     tolerance: of the interpolation, as a share of the range of the values; None: every point is evaluated.
     holdout: fewest random points of a hold-out.  Where the largest error at 64 of them is within the tolerance, at most 5.6% of
-        the other points are not, with 97.5% confidence; the bound extrapolates to all.
+        the other points are not, with 97.5% confidence (the first look has half of 5%); `error_bound` extrapolates to all.
     workers: threads that evaluate.
-    max_evaluations: budget, which counts the axes and the centre, always evaluated, and the points of a store.  Allowed only
-        with a tolerance.
+    max_evaluations: budget, which counts the axes and the centre, always evaluated, and points kept from an earlier run.
+        Allowed only with a tolerance.
     """
 
     tolerance: float | None = 0.01
@@ -56,8 +56,11 @@ class SliceSettings:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """values [points]: evaluated or interpolated, nan where neither; holdout: |prediction - value| at the points of the last
-    hold-out; looks: number of hold-outs; reason: why it ended."""
+    """Outcome of a refinement.
+
+    values [points]: evaluated or interpolated, nan where neither.  holdout: |prediction - value| at the points of the last
+    hold-out, none where every point was evaluated.  looks: number of hold-outs.  reason: why it ended.
+    """
 
     values: np.ndarray
     holdout: np.ndarray
@@ -68,13 +71,17 @@ class Refined:
 def evaluate_adaptively(
     evaluations: GridEvaluations, grid: PlaneInterpolant, settings: SliceSettings, generator: torch.Generator
 ) -> Refined:
-    """Evaluate points until the others are known to within the tolerance."""
+    """Evaluate in rounds until the others are predicted within the tolerance, or all are known; the axes in any case.
+
+    A round that does not fit into max_evaluations is not begun.
+    """
     assert settings.tolerance is not None
     errors, looks, fill = np.empty(0), 0, COARSE
     evaluations.require(grid.axes)
-    while not (known := evaluations.known).all():
+    while not (known := evaluations.known).all():  # `require` sets entries of this array
         filling = grid.farthest(known, fill)
         drawn = _draw(known, filling, max(settings.holdout, fill), generator)
+        # 1: the centre
         if 1 + int(known.sum()) + len(filling) + len(drawn) > settings.max_evaluations:
             return Refined(evaluations.value, errors, looks, "evaluation budget")
         evaluations.require(filling)
@@ -82,7 +89,7 @@ def evaluate_adaptively(
         evaluations.require(drawn)
         errors, looks = np.abs(predicted - evaluations.value)[drawn], looks + 1
         fill = 3 * int(known.sum() - len(grid.axes)) // 4
-        errors[~np.isfinite(errors)] = inf
+        errors[~np.isfinite(errors)] = inf  # without a number no bound holds
         bound = error_bound(errors, int((~known).sum()), looks)
         if bound <= settings.tolerance * value_range(evaluations.value) and not known.all():
             values = np.where(known, evaluations.value, predicted)

@@ -1,18 +1,18 @@
-"""Anisotropy of curvatures: indices of the spectrum lambda_1 >= ... >= lambda_n (signed), each with a bracket.
+"""Anisotropy of curvatures: indices of the signed eigenvalues lambda_max >= ... >= lambda_min, each with a bracket.
 
-    eigenvalue_ratio     lambda_1 / lambda_n                  the anisotropy index as the paper writes it, signed
-    negative_ratio       |min(lambda_n, 0)| / lambda_1        how far from a minimum: 0 at one
-    top_mass             lambda_1 / sum |lambda_i|            how much of all curvature is in one direction
+    eigenvalue_ratio     lambda_max / lambda_min              the anisotropy index as StableGS's Eq. (3) writes it, signed
+    negative_ratio       |min(lambda_min, 0)| / lambda_max    how far from a minimum: 0 at one
+    top_mass             lambda_max / sum |lambda_i|          how much of all curvature is in its direction; signed
     participation_ratio  (sum |lambda_i|)^2 / sum lambda_i^2  over how many directions it is spread, 1 to n
 
 Brackets follow from the eigenvalues' residuals, how far out an end that has not converged may lie, the round-off and the sums'
-intervals (each at a level that gives the quotient 95%).  The eigenvalue ratio is negative for an indefinite operator; where
-lambda_n may be zero it has no upper bound.
+intervals (each at 97.5%, so that two hold together with at least 95%).  The eigenvalue ratio is negative for an indefinite
+operator; where lambda_min may be zero its bracket is for the modulus, without an upper bound.
 
-What the bracket of an end is certain of is that a true eigenvalue lies within; which one it is, is not.  A search that ends at
-its tolerance may have taken the neighbour of an end for it, where the two are about as far apart as was asked for, and the
-end itself then lies outside, with every index that is made of it: on a Cauchy spectrum (n = 100, rtol = 1%) in 27 of 250 seeds,
-on spectra with a gap at the ends in none.  `EigenEnds.beyond` bounds how far out it may lie.
+The bracket of an end is sure to contain a true eigenvalue, but not sure to contain the end.  A search that stops at its
+tolerance may have found the end's neighbour, if the two are about rtol apart.  Then the end lies outside its bracket, and every
+index made of it: on a Cauchy spectrum (n = 100, rtol = 1%) in 27 of 250 seeds, on spectra with a gap at the ends in none.
+`EigenEnds.beyond` bounds how far out it may lie; brackets include it only for ends that stopped early.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Anisotropy(ShortRepr):
 
 
 CONFIDENCE = 0.95
-ARRIVED = ("tolerance", "noise floor", "exact")  # reasons to stop that leave no end behind
+ARRIVED = ("tolerance", "noise floor", "exact")  # reasons to stop at which no bracket is widened by `beyond`
 JOINT = 1 - (1 - CONFIDENCE) / 2  # each of two intervals, so that both hold with CONFIDENCE (Bonferroni)
 
 
@@ -74,7 +74,7 @@ def eigenvalue_ratio(ends: EigenEnds) -> Bracket:
     value = float(ends.largest.values[0]) / smallest if smallest else None
     if bottom[0] <= 0 <= bottom[1]:
         return Bracket(
-            value, _at_least(top, bottom), inf, "lambda_min is not resolved from zero: the bracket is for |A|"
+            value, _at_least(top, bottom), inf, "lambda_min is not resolved from zero: the bracket is for its modulus"
         )
     quotients = [a / b for a in top for b in bottom if isfinite(a) or isfinite(b)]
     note = "lambda_max is not resolved from zero: definite or indefinite"
@@ -88,7 +88,8 @@ def negative_ratio(ends: EigenEnds) -> Bracket:
     top, bottom = _intervals(ends)
     if top[1] <= 0:
         return Bracket(None, inf, inf, "no positive curvature: the operator is negative semi-definite")
-    low, high = max(-bottom[1], 0.0) / top[1], max(-bottom[0], 0.0) / top[0] if top[0] > 0 else inf
+    low = max(-bottom[1], 0.0) / top[1]
+    high = max(-bottom[0], 0.0) / top[0] if top[0] > 0 else inf
     if top[0] <= 0:
         return Bracket(None, low, high, "if lambda_max is positive at all: not resolved from zero")
     note = "lambda_min is not resolved from zero" if bottom[0] < 0 <= bottom[1] else ""
@@ -96,24 +97,24 @@ def negative_ratio(ends: EigenEnds) -> Bracket:
 
 
 def top_mass(ends: EigenEnds, density: SpectralDensity) -> Bracket:
-    """lambda_max / sum |lambda|, at most 1: the share of all curvature that lies in the steepest direction."""
-    top, total, known = _intervals(ends)[0], absolute_sum(density, JOINT), _farthest(ends)
+    """lambda_max / sum |lambda|, at most 1: the share of all curvature in the direction of lambda_max, and of its sign."""
+    top, total, least_magnitude = _intervals(ends)[0], absolute_sum(density, JOINT), _least_magnitude(ends)
     if not total.value:
         return Bracket(None, inf, inf, "the operator is zero")
-    low, high = _quotients(top, (max(total.low, known), max(total.high, known)))
-    value = min(float(ends.largest.values[0]) / max(total.value, known), 1.0)
+    low, high = _quotients(top, (max(total.low, least_magnitude), max(total.high, least_magnitude)))
+    value = min(float(ends.largest.values[0]) / max(total.value, least_magnitude), 1.0)
     return Bracket(value, low, min(high, 1.0), total.note)
 
 
 def participation_ratio(ends: EigenEnds, density: SpectralDensity) -> Bracket:
     """(sum |lambda|)^2 / sum lambda^2, between 1 and n: over how many directions curvature is spread."""
-    total, known = absolute_sum(density, JOINT), _farthest(ends)
+    total, least_magnitude = absolute_sum(density, JOINT), _least_magnitude(ends)
     if not total.value:
         return Bracket(None, inf, inf, "the operator is zero")
     unit = total.value  # so that no square leaves the range of floats
     squares = density.integral(lambda x: (x / unit).square(), JOINT)
-    least, middle, most = (max(value, known) / unit for value in (total.low, unit, total.high))
-    floor = (known / unit) ** 2
+    least, middle, most = (max(value, least_magnitude) / unit for value in (total.low, unit, total.high))
+    floor = (least_magnitude / unit) ** 2
     low = least**2 / max(squares.high, floor)
     square = max(squares.low, floor)
     high = most**2 / square if square else inf
@@ -139,14 +140,15 @@ def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float
     return (max(a - slack, least), most), (least, min(d + slack, most))
 
 
-def _farthest(ends: EigenEnds) -> float:
-    """A magnitude that some eigenvalue has at least: what both sums are bounded by from below."""
+def _least_magnitude(ends: EigenEnds) -> float:
+    """A lower bound of the largest |lambda|, and so of sum |lambda|; its square bounds sum lambda^2."""
     return max(0.0, *(max(low, -high) for low, high in _intervals(ends)))
 
 
 def _quotients(top: tuple[float, float], sizes: tuple[float, float]) -> tuple[float, float]:
     """The least and the largest quotient of a number in `top` and one above 0 in `sizes`."""
-    over = sizes[top[0] >= 0], sizes[top[1] < 0]
+    # a positive end is least over the largest size and most over the smallest; a negative one the other way round
+    over = sizes[1 if top[0] >= 0 else 0], sizes[1 if top[1] < 0 else 0]
     least, most = (
         end / size if size else copysign(inf, end) if end else 0.0 for end, size in zip(top, over, strict=True)
     )

@@ -1,8 +1,11 @@
 """Hutchinson's estimator, E z^T H z = tr H for E z z^T = I (Girard 1989, Hutchinson 1990), with a sequential stopping rule.
 
 An adaptive run stops when half the width of its interval is at most max(rtol |trace|, atol).  Every look at the interval may
-find it too short by chance.  So a run looks only when the number of probes has grown by the factor GROWTH since the last look,
-stops only if the tolerance still holds CONFIRMATION probes later (Simons 1968), and widens its interval by WIDENING.
+find it too short by chance.  So a run that misses its tolerance looks again only after GROWTH times as many probes; one that
+meets it looks again CONFIRMATION probes later and stops if it still does (Simons 1968).  For the chance that is left its
+interval is wider by WIDENING.
+
+A block is some of the rows; a group is GROUP probes, whose pairs are summed together.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,10 +41,10 @@ class TraceSettings:
 
     distribution: entries of a probe are random signs ("rademacher") or standard normal ("gaussian").
     reading, method: see `landscape.traces.trace`.
-    rtol, atol: a block is done when half the width of its interval is at most max(rtol |trace|, atol).  With both 0 every block
-        takes max_probes, unless max_seconds end it.  confidence: of the interval.
+    rtol, atol: a block is done when half the width of its interval is at most max(rtol |trace|, atol).  With both 0 every
+        block takes max_probes, unless max_seconds end it.  confidence: of the interval.
     min_probes: probes before the first look at the error.  max_probes: largest number of matvecs of a block by any method.
-    max_seconds: for all blocks together, after min_probes.  batch: vectors in one application of the operator.
+    max_seconds: for all blocks together; each takes min_probes even beyond it.  batch: vectors the operator takes at once.
     memory: GiB for the vectors that a sketch keeps; XTrace stops when they are full.
     """
 
@@ -91,7 +94,7 @@ class TraceSettings:
 
     @property
     def least(self) -> int:
-        """The fewest matvecs of the method: LEAST for each of its parts (sketch, its products, probes)."""
+        """The fewest matvecs of the method: LEAST for each part, Hutch++'s sketch, range and probes, XTrace's two."""
         return LEAST * {"auto": 1, "hutchinson": 1, "hutch++": 3, "xtrace": 2}[self.method]
 
     @property
@@ -120,10 +123,11 @@ class StoppingRule:
 
 
 class Hutchinson:
-    """Hutchinson's estimator on one operator, for several groups of rows at once.
+    """Hutchinson's estimator on one operator, for several blocks at once.
 
-    rows: the groups, by name.  samples: z^T H z, a row for each group.  known: part of the trace that the operator lacks;
-    spent: matvecs of this part.  keep: number of probes up to which they and their products stay in `kept`.
+    rows: of the blocks, by name.  samples: z^T H z, a row for each block.  known: part of the trace that the operator lacks,
+    added to every block, so that there may be one alone; spent: matvecs of this part.  keep: most probes that stay, with their
+    products, in `kept`, which is emptied when there are more.
     """
 
     def __init__(
@@ -140,23 +144,28 @@ class Hutchinson:
         self.operator, self.rows, self.generator = operator, rows, generator
         self.settings, self.deadline, self.known, self.spent, self.keep = settings, deadline, known, spent, keep
         self.samples = torch.empty(len(rows), 0, dtype=torch.float64)
+        assert not known or len(rows) == 1
         self.groups: dict[str, list[PowerSums]] = {name: [] for name in rows}
-        self.current: list[tuple[Tensor, Tensor]] = []  # Z and H Z of the probes that are in no group yet
+        self.current: list[tuple[Tensor, Tensor]] = []  # Z and H Z of the probes that are in no full group yet
         self.kept: list[tuple[Tensor, Tensor]] = []
 
     def estimate(self, progress: Progress | None = None) -> dict[str, TraceEstimate]:
-        """The trace of every group of rows.  Progress counts matvecs."""
+        """The trace of every block.  Progress counts matvecs."""
         *_, (estimates, _) = self.looks(self.settings.min_probes, progress)
         return estimates
 
     def looks(self, first: int, progress: Progress | None = None) -> Iterator[tuple[dict[str, TraceEstimate], bool]]:
-        """The estimates at every look, the first one after `first` probes, and whether the run ends there."""
+        """The estimates at every look, the first one after `first` probes, and whether the run ends there.
+
+        Before it ends, the reason of an estimate that misses its tolerance means nothing.
+        """
         settings, probes, rule, ended = self.settings, 0, StoppingRule(first, self.settings.max_probes), False
         if self.operator.dim == 0:
             exact = (self.known, settings.confidence, self.spent)
             yield {name: TraceEstimate.exact(name, 0, *exact) for name in self.rows}, True
             return
         while not ended:
+            # no further than the next look or the end of a group
             self.draw(min(settings.batch, rule.next - probes, GROUP - probes % GROUP))
             probes = self.samples.shape[1]
             if progress:
@@ -177,12 +186,12 @@ class Hutchinson:
         self.kept = [*self.kept, (Z, Y)] if self.samples.shape[1] <= self.keep else []
         self.current.append((Z, Y))
         if self.samples.shape[1] % GROUP == 0:
-            for name, group in self._open_groups().items():
+            for name, group in self._open_group().items():
                 self.groups[name].append(group)
             self.current = []
 
-    def _open_groups(self) -> dict[str, PowerSums]:
-        """The power sums of every group of rows, from the probes in no group of probes yet."""
+    def _open_group(self) -> dict[str, PowerSums]:
+        """Power sums of every block, from the probes that are in no full group yet; {} for fewer than FEWEST."""
         if sum(Z.shape[1] for Z, _ in self.current) < FEWEST:
             return {}
         Z, Y = joined(self.current)
@@ -191,7 +200,7 @@ class Hutchinson:
 
     def _estimates(self, reason: StopReason) -> dict[str, TraceEstimate]:
         """The estimates so far.  reason: for estimates that have not reached the tolerance."""
-        settings, results, opened = self.settings, {}, self._open_groups()
+        settings, results, opened = self.settings, {}, self._open_group()
         probes = self.samples.shape[1]
         widening = WIDENING if settings.adaptive else 1.0
         for samples, (name, rows) in zip(self.samples + self.known, self.rows.items(), strict=True):
