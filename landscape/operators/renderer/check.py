@@ -10,12 +10,13 @@ What makes products meaningless is refused when the operator is made: a NaN, ano
 """
 
 from dataclasses import dataclass
+from math import inf
 
 import torch
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.operators.renderer.renderer import RendererHessian
+from landscape.operators.renderer.renderer import ProductErrors, RendererHessian
 from landscape.probes import draw_probes
 
 WRONG = 0.03  # of a gradient: on splats the estimate of a right one was off by 0.01 at most
@@ -91,20 +92,25 @@ def check_renderer(hessian: RendererHessian, generator: torch.Generator) -> Rend
         float(stated.kinks),
         ratios,
         tuple(name for name in hessian.blocks if name not in ratios),
-        float(stated.total / length) if length else 0.0,
+        _relative(hessian, stated, length),
     )
 
 
 def require_resolved(hessian: RendererHessian, generator: torch.Generator) -> float:
     """The error of a product with a random unit vector.  Raises InputError where it is as long as the product."""
     product, stated = hessian.measured(_vectors(hessian, generator)[:, :1])
-    error, length = float(stated.total), float(torch.linalg.vector_norm(product.double()))
-    if length and not error < UNRESOLVED * length:
+    relative = _relative(hessian, stated, torch.linalg.vector_norm(product.double()))
+    if not relative < UNRESOLVED:
         raise InputError(
-            f"expected products that steps resolve, got an error of {error / length:.0%} of the length of H v; check_renderer "
+            f"expected products that steps resolve, got an error of {relative:.0%} of the length of H v; check_renderer "
             "says why, and gauss_newton_traces needs no step"
         )
-    return error
+    return float(stated.total)
+
+
+def _relative(hessian: RendererHessian, stated: ProductErrors, length: Tensor) -> float:
+    """The error over the length of one product; inf where noise covers all views, 0 where nothing changes."""
+    return float(stated.total / length) if length else inf if hessian.noise else 0.0
 
 
 def gradient_ratios(hessian: RendererHessian, V: Tensor, factor: float = 1.0) -> list[float | None]:

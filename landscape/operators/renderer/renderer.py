@@ -16,9 +16,9 @@ wrong by more than the length of H v.
 step adds jump / h to one estimate.  `one_sided` takes the mean of the two where they agree, the central difference, and the
 smaller one elsewhere: the jump lies on the other side.
 
-**The step h.**  Rounding the image, by u = eps / 4 of its size on average, makes an error u |I| / |dI| in J v, with dI the
-change of the image along the step.  The number of jumps grows like the step, and where they are the difference is one-sided,
-with an error like |dI| / |I|.  Both are equal at |dI| = sqrt(u) |I|.  The noise of a renderer that does not repeat itself
+**The step h.**  |.| is the root mean square, dI the image's change in a step.  Rounding the image, by u = eps / 4 of its size
+on average, makes a relative error u |I| / |dI| in J v.  Jumps make differences one-sided in pixels whose share grows with the
+step, an error like |dI| / |I|.  The two are equal at |dI| = sqrt(u) |I|.  The noise of a renderer that does not repeat itself
 takes the place of u where it is larger.  TRIALS renders of the first view that v changes find h.
 """
 
@@ -40,17 +40,18 @@ from landscape.operators.renderer.parameters import Parameters
 from landscape.results import ShortRepr
 
 TRIALS = 2  # renders that find a step
-FACTOR = 1e4  # by which one of them changes it at most
+FACTOR = 1e4  # the largest by which a trial changes h
 ROUNDING = 1 / 4  # mean error of a rounded number, in units of eps
-KEPT = 1 << 30  # bytes of J^T g of the views; of views beyond it costs a backward pass in each product
+KEPT = 1 << 30  # bytes for J^T g of the first views; each other view costs one backward pass more in a product
+SEEN = 3  # a smaller change of an image is noise, of which that of two renders is sqrt(2)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ProductErrors(ShortRepr):
     """Errors of the products with k vectors, as lengths.
 
-    step: of the difference to the product at twice the step.  An error that grows with the step differs by as much as it is,
-    or more; rounding and jumps are independent at the two steps.
+    step: of the difference to the product at twice the step.  An error in proportion to h or a higher power changes by at
+    least its own size when h doubles; those of rounding and jumps differ at random.
     noise: of the difference of two equal products, over sqrt(2); 0 for a renderer that repeats itself.
     kinks: share of |J v|^2 in pixels whose one-sided differences disagree.
     asymmetry: rms |u . H v - v . H u| / (|u| |v|) over pairs of the vectors; nan for a single one.
@@ -79,7 +80,7 @@ class LinearView:
     gradient: Tensor
 
     def curvature(self, u: Tensor) -> Tensor:
-        """l'' u."""
+        """l'' u, a tensor like the image."""
         if not self.gradient.requires_grad:  # the loss is linear in the image
             return torch.zeros_like(u)
         (product,) = torch.autograd.grad(
@@ -109,12 +110,12 @@ class RendererHessian:
     """The Hessian of the mean loss over views, from a renderer that need be differentiable only once.
 
     render: from a view to its image, a tensor of any shape that depends on the parameters as they are at the call.
-    parameters: the leaf tensors by name, of one type on one device; a block for each, in this order, and one for neighbours
-        whose names agree before a slash, as sh/dc and sh/rest.
+    parameters: the leaf tensors by name, of one type on one device; each is a block, in this order; neighbours whose names
+        agree before a slash, as sh/dc and sh/rest, are one.
     loss: from (image, view) to a tensor of one number, by torch operations that are differentiable twice in the image.
     views: one graph at a time is kept, whatever their number.
-    noise: standard deviation of the renderer's noise, relative to the size of the image; what two renders of the first view
-        show where that is more.
+    noise: standard deviation of the renderer's noise, relative to the size of the image; raised to what two renders of the
+        first view show.
 
     value, gradient: of the mean loss.  gauss_newton: the operator J^T l'' J.  deterministic: whether the two renders are equal.
     Products move the parameters in place, and bring them back to the bit, after an exception too.  Approximations: see `error`.
@@ -145,14 +146,14 @@ class RendererHessian:
         self.point = self.parameters.flat
         gradient = torch.zeros(self.dim, dtype=torch.float64, device=self.point.device)
         room = int(KEPT / (self.point.numel() * self.point.element_size()))
-        losses, seen, self.still = [], 0.0, []  # J^T g of the first views
+        losses, seen, self.kept = [], 0.0, []  # J^T g of the first views
         for index in range(len(views)):
             linear = self.linear(index)
-            still = self.parameters.vjp(linear.image, linear.gradient.detach())
-            gradient += still
+            Jg = self.parameters.vjp(linear.image, linear.gradient.detach())
+            gradient += Jg
             losses.append(linear.loss)
             if index < room:
-                self.still.append(still)
+                self.kept.append(Jg)
             if index == 0:
                 seen = rms(self.image(0, linear.image) - linear.image) / sqrt(2) / (rms(linear.image) or 1.0)
         self.value, self.gradient = sum(losses) / len(losses), (gradient / len(views)).to(self.dtype)
@@ -171,12 +172,13 @@ class RendererHessian:
         return sqrt(max(self.noise, ROUNDING * torch.finfo(self.dtype).eps))
 
     def passes(self, vectors: int) -> tuple[int, int]:
-        """Renders and backward passes of a product with so many vectors, if the first view sees them; else at most."""
+        """Renders and backward passes of a product with so many vectors, if every view sees them; else at most."""
         views, pulled = len(self.views), (3 if self.curved else 1) * vectors
-        more = views - len(self.still) if self.curved else 0
+        more = views - len(self.kept) if self.curved else 0
         return views * (1 + 2 * vectors) + TRIALS * vectors, views * pulled + more
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """H V, or G V."""
         require_vectors(V, self.dim, self.dtype)
         return self.products(V)[0]
 
@@ -237,13 +239,13 @@ class RendererHessian:
         with self.at_point():
             for index in range(len(self.views)):
                 view = self.linear(index)
-                still = self.still[index] if index < len(self.still) else self.point
-                if self.curved and still is self.point:
-                    still = self.parameters.vjp(view.image, view.gradient.detach(), keep=True)
+                Jg = self.kept[index] if index < len(self.kept) else None  # J^T g
+                if self.curved and Jg is None:
+                    Jg = self.parameters.vjp(view.image, view.gradient.detach(), keep=True)
                 for j, v in enumerate(V.unbind(dim=1)):
                     steps[j] = steps[j] or self.step(index, view, v)
                     if steps[j]:  # else the view does not see v
-                        Hv, Jv, apart = self._product(index, view, still, v, factor * steps[j])
+                        Hv, Jv, apart = self._product(index, view, Jg, v, factor * steps[j])
                         total[:, j] += Hv
                         squares = Jv.double().square()
                         kinks[:, j] += torch.stack([squares[apart].sum(), squares.sum()]).cpu()
@@ -261,20 +263,23 @@ class RendererHessian:
             yield
 
     def step(self, index: int, view: LinearView, v: Tensor) -> float:
-        """The step h along v; 0 where it does not change the image."""
-        largest, target = float(v.abs().max()), self.change * (rms(view.image) or 1.0)
+        """The step h along v; 0 where it does not change the image, or by its noise alone."""
+        largest, size, seen = float(v.abs().max()), rms(view.image) or 1.0, False
+        # at first the largest parameter moves by `change` of its size
         h = self.change * (float(self.point.abs().max()) or 1.0) / largest if largest else 0.0
         for _ in range(TRIALS if largest else 0):
             self.parameters.write(self.point.double() + h * v.double())
             change = rms(self.image(index, view.image) - view.image)
-            h *= min(max(target / change, 1 / FACTOR), FACTOR) if change else 0.0
+            seen, told = change > SEEN * self.noise * size, max(change, SEEN * self.noise * size)
+            # the change grows like h
+            h *= min(max(self.change * size / told, 1 / FACTOR), FACTOR) if told else 0.0
         self.parameters.write(self.point)
-        return h
+        return h if seen else 0.0
 
     def change_of_image(
         self, index: int, view: LinearView, v: Tensor, h: float, cotangent: Tensor | None = None
     ) -> tuple[Tensor, Bool[Tensor, "..."], list[Tensor]]:
-        """J v of one view, for two renders, where its one-sided differences disagree, and J+^T and J-^T of a cotangent."""
+        """J v of one view, where its one-sided differences disagree, and J+^T and J-^T of a cotangent; two renders."""
         images, pulled = [], []
         for step in (h, -h):
             self.parameters.write(self.point.double() + step * v.double())
@@ -288,13 +293,13 @@ class RendererHessian:
         return *one_sided((images[0] - middle) / h, (middle - images[1]) / h), pulled
 
     def _product(
-        self, index: int, view: LinearView, still: Tensor, v: Tensor, h: float
+        self, index: int, view: LinearView, Jg: Tensor | None, v: Tensor, h: float
     ) -> tuple[Tensor, Tensor, Bool[Tensor, "..."]]:
-        """H_m v of one view, J v, and where its one-sided differences disagree.  still: J^T g."""
+        """H_m v of one view, J v, and where its one-sided differences disagree.  Jg: J^T g."""
         Jv, apart, pulled = self.change_of_image(index, view, v, h, view.gradient.detach() if self.curved else None)
         product = self.parameters.vjp(view.image, view.curvature(Jv), keep=True)
-        if self.curved:
-            product += one_sided((pulled[0] - still) / h, (still - pulled[1]) / h)[0]
+        if self.curved and Jg is not None:
+            product += one_sided((pulled[0] - Jg) / h, (Jg - pulled[1]) / h)[0]
         return product, Jv, apart
 
 
@@ -313,11 +318,11 @@ def _require_image(image: object, index: int) -> None:
 
 
 def _alike(image: Tensor, like: Tensor, index: int) -> Tensor:
-    """The image without its graph.  InputError unless it is finite and of the size of another one of the same view."""
+    """The image without its graph.  InputError unless it is finite and has the shape of another render of the view."""
     if image.shape != like.shape:
         raise InputError(
             f"expected images of one size for view {index}, got {tuple(like.shape)}, then {tuple(image.shape)}; fix the size"
         )
     if not torch.isfinite(image).all():
-        raise InputError(f"expected a finite image of view {index} a small step away, got NaN or infinity")
+        raise InputError(f"expected a finite image of view {index} in every render, got NaN or infinity")
     return image.detach()
