@@ -1,22 +1,22 @@
-"""Carriers of an eigenvector of the loss's Hessian: the Gaussians in which it lies, and renders of steps along it.
+"""Carriers of an eigenvector at either end of the spectrum: the Gaussians in which it lies, and renders of steps along it.
 
 mass       of Gaussian i in a unit vector v: the sum of v^2 over its parameters
-carriers   the Gaussians with most mass, at least LEAST each
+carriers   the Gaussians with a share of LEAST of the mass or more, MOST at most; the heaviest in any case
 view       the one in which the first carrier has most weight
 steps      sqrt(2 RISE L / |lambda|), at which curvature alone changes the loss L by RISE L, halved again and again
 factor     of a step s: the mean change of the rendered loss at +s and -s, over lambda s^2 / 2; the slope cancels, and the
            factor is 1 where the second-order model holds
-kinks      sum_p w j^2 [|r| < NEAR] / NEAR over pixels p with the weight w in L1, the residual r and its change j along v: the
-           mean of w (|r + s j| + |r - s j| - 2 |r|) / s^2 over residuals r that are even about 0.  A curvature that L1 has in
-           every direction, never below 0, and that the Hessian, at signs held still, leaves out
+kinks      sum_p w j^2 [|r| < NEAR] / NEAR over the numbers p of the images (w: weight in the loss, r: residual, j: its change
+           along v): the mean of w (|r + s j| + |r - s j| - 2 |r|) / s^2 where residuals are spread evenly near 0.  A curvature
+           that L1 has in every direction, never below 0, and that the Hessian, at signs held still, leaves out
 renders    of the view around the first carrier, all Gaussians moved by -step, 0 and +step along v; the step is the longest
-           whose factor is within AGREES of 1, else the longest with a factor above 0, else the longest
+           whose factor is within AGREES of 1, else the longest whose factor is above 0, else the longest of all
 
-Why renders refute a small negative end: on fern (2,000 steps; lambda_min = -0.074) second differences over 1/4 to 4 of the
-optimiser's step are +0.20 to +0.22.  Of the difference kinks make 0.11 to 0.17 (by the formula 0.15), the order of the splats
-nothing (below 0.0002), and 0.10 to 0.18 is left: splats that pass their threshold alpha_min, and higher orders.  Rendered
-without that threshold, at signs held still, the loss curves by -0.027 to -0.011 up to the optimiser's step.  A steep end gains
-by the same: on DTU's scan 24 (1,500 steps) 48 becomes 61 over the optimiser's step, where kinks make 13 by the formula.
+Why renders can refute a small negative end.  On fern (2,000 steps) lambda_min is -0.074, but second differences of rendered
+losses over 1/4 to 4 steps of the optimiser are +0.20 to +0.22.  Kinks of L1 make 0.11 to 0.17 of the gap (0.15 by the formula),
+changes of order below 0.0002, and splats that cross alpha_min, with higher orders, the other 0.10 to 0.18.  Without alpha_min
+and with signs held still it is -0.027 to -0.011.  A steep end gains by the same: on DTU's scan 24 (1,500 steps) 48 becomes 61
+over the optimiser's step, where kinks make 13 by the formula.
 """
 
 from collections.abc import Sequence
@@ -43,9 +43,10 @@ from splat.render.render import render
 from splat.render.sight import Sight, sight
 from splat.scenes.view import View
 
-NEAR = 0.01  # of a residual, over which its density is taken to be even
-LEAST, MOST = 0.05, 5  # share of the mass that makes a carrier; most carriers
-RISE, STEPS = 0.01, 7  # relative change of the loss by the longest step (the shortest: 2e-6, above round-off); steps
+NEAR = 0.01  # |residual|, of a range of 1, below which residuals are taken to be spread evenly
+LEAST, MOST = 0.05, 5  # smallest share of the mass of a carrier; most carriers
+RISE = 0.01  # relative change of the loss at the longest step, by the curvature
+STEPS = 7  # each half of the one before; the shortest changes the loss by 2e-6, above round-off
 AGREES = 0.2  # largest |factor - 1| that counts as agreement
 SIGMAS = 2.0  # standard deviations at which an outline is drawn
 ROOM, SMALLEST = 1.3, 8  # size of a crop: in outlines; at least 1 / SMALLEST of its view
@@ -106,23 +107,24 @@ def steepest(
 def heaviest(
     objective: SceneObjective, vectors: Sequence[Float[Tensor, " p"]], generator: torch.Generator
 ) -> list[Carries]:
-    """The Gaussian with most mass in each eigenvector; with its shape on the CPU."""
+    """The Gaussian with most mass in each eigenvector; on the CPU also its shape, in words."""
     random = masses(torch.empty_like(objective.active.flat).normal_(generator=generator), objective.active)
-    whole = objective.active.flat.device.type == "cpu"
-    sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views] if whole else []
-    values, found = sight_fields(sights) if whole else {}, []
+    on_cpu = objective.active.flat.device.type == "cpu"
+    sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views] if on_cpu else []
+    values, found = sight_fields(sights) if on_cpu else {}, []
     for vector in vectors:
         mass = masses(vector, objective.active)
         mass, i = mass / mass.sum(), int(mass.argmax())
         part = objective.active.with_flat(vector).select(torch.tensor([i], device=mass.device))
         shares = mass_shares(part.flat, part.blocks)
+        # random_share: for comparison, the largest share of a Gaussian in a random vector
         one = Carries(
             gaussian=int(objective.mask.nonzero()[i, 0]),
             share=float(mass[i]),
             random_share=float(random.max() / random.sum()),
             attribute=max(shares, key=shares.__getitem__),
         )
-        if whole:
+        if on_cpu:
             view = objective.views[_view_with_most(sights, i)]
             carrier = _carrier(objective, view, vector, values, mass, i)
             one.shape, one.view, one.outline = shape(carrier, view), view.name, carrier.outline
@@ -131,7 +133,7 @@ def heaviest(
 
 
 def kink_curvature(objective: SceneObjective, vector: Float[Tensor, " p"]) -> float:
-    """The curvature along a unit vector by the kinks of L1, which the Hessian leaves out; 0 for a loss without."""
+    """The curvature along a unit vector by the kinks of L1, which the Hessian leaves out; 0 for a loss without L1."""
     loss, total = objective.loss_settings, 0.0
     if loss.pixel == "l1":
         for view, linearized in zip(objective.views, objective.linearized, strict=True):
@@ -167,7 +169,9 @@ def _losses_at(
 
 
 def shown_step(factors: Sequence[float]) -> int:
-    """Index of the longest step whose factor is within AGREES of 1, else above 0, else 0.  Steps descend.
+    """Index of the longest step whose factor is within AGREES of 1, else of the longest with one above 0, else of the longest.
+
+    factors: of steps that descend.
 
     >>> shown_step([0.5, 1.1, 0.9]), shown_step([-0.2, 0.5]), shown_step([-0.2, -1.0])
     (1, 1, 0)
@@ -179,7 +183,8 @@ def shown_step(factors: Sequence[float]) -> int:
 def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Sequence[float]) -> str:
     """Sentence that compares renders with the curvature, at the step shown and over all steps, which descend."""
     best = shown_step(factors)
-    step, factor, alone = steps[best], factors[best], 50 * end.curvature * steps[best] ** 2 / loss
+    step, factor = steps[best], factors[best]
+    alone = 50 * end.curvature * step**2 / loss  # half of it, in percent of the loss
     extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])} units of the parameters"
     ways = ("lower", "raise") if end.curvature < 0 else ("raise", "lower")
     if not factor > 0:
@@ -221,13 +226,15 @@ def _carrier(
 
 
 def outline_of(splat: Float64[Tensor, "9"]) -> list[float]:
-    """Ellipse of a splat at SIGMAS standard deviations: centre x, y and half axes in px, angle of the longer axis.
+    """Ellipse of a splat (place x, y; inverse covariance a, b, c; ...) at SIGMAS standard deviations.
+
+    Centre x, y and half axes in px, angle of the longer axis.
 
     >>> outline_of(torch.tensor([5.0, 6.0, 0.25, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
     [5.0, 6.0, 4.0, 2.0, 0.0]
     """
     x, y, a, b, c = splat[:5].tolist()
-    values, vectors = np.linalg.eigh(np.array([[a, b], [b, c]]))  # ascending: the longer axis first
+    values, vectors = np.linalg.eigh(np.array([[a, b], [b, c]]))  # ascending, of the inverse: the longer axis first
     long, short = SIGMAS / np.sqrt(np.maximum(values, np.finfo(float).tiny))
     axis = vectors[:, 0] * (1 if vectors[0, 0] >= 0 else -1)
     return [x, y, float(long), float(short), float(np.arctan2(axis[1], axis[0]))]
@@ -239,6 +246,7 @@ def crop_around(outlines: Sequence[Sequence[float]], width: int, height: int) ->
     >>> crop_around([[10.0, 90.0, 3.0, 1.0, 0.0]], 160, 120)
     (0, 82, 20, 97)
     """
+    # points of a disc, of which those outside of the picture are left out
     turn, radius = np.meshgrid(np.linspace(0, 2 * np.pi, 181), np.linspace(0, 1, 51))
     x, y, long, short, angle = np.array(outlines).T[:, :, None, None]
     along, across = long * radius * np.cos(turn), short * radius * np.sin(turn)
@@ -258,12 +266,12 @@ def crop_around(outlines: Sequence[Sequence[float]], width: int, height: int) ->
 
 
 def _pictures(
-    objective: SceneObjective, view: View, steps: dict[str, Tensor], crop: Sequence[int]
+    objective: SceneObjective, view: View, places: dict[str, Tensor], crop: Sequence[int]
 ) -> tuple[Pictures, Shade]:
     left, top, right, bottom = crop
     images = {
         name: render(objective.active.with_flat(flat), view.camera, objective.background, objective.settings).image
-        for name, flat in steps.items()
+        for name, flat in places.items()
     }
     parts = {name: image[:, top:bottom, left:right] for name, image in images.items()}
     change = (parts["plus"] - parts["minus"]).mean(dim=0).double().numpy()

@@ -1,16 +1,21 @@
 """The loss of one view, linearised: its value and gradient, and exact products of its Hessian with vectors.
 
-The loss is l(R(P(theta))): the projection P gives splats, the compositing R an image I, and l compares it with the photograph.
-A prime is a derivative.  With g = l' (the gradient in I) and a = R'^T g,
+The loss is l(C(P(theta))): the projection P gives splats, the compositing C an image I, and l compares it with the photograph.
+A prime is a derivative.  With g = l' (the gradient in I) and a = C'^T g,
 
-    gradient  P'^T R'^T g
-    J u       R' P' u
-    G u       P'^T R'^T l'' R' P' u                                          (Gauss-Newton; l'' may be indefinite: SSIM)
-    H u       P'^T [ R'^T l'' R' P' u + (g . R'')(P' u) ] + (a . P'') u
+    gradient  P'^T C'^T g
+    J u       C' P' u
+    G u       P'^T C'^T l'' C' P' u                                          (Gauss-Newton; l'' may be indefinite: SSIM)
+    H u       P'^T [ C'^T l'' C' P' u + (g . C'')(P' u) ] + (a . P'') u
 
-P' and P'' of every Gaussian, tile lists, final transmittances, g and a are computed once.  Each product is then two passes over
-the pixels for K vectors together: the columns of U (p, K), laid out like `Gaussians.flat`.  What is piecewise constant counts
-as constant: the order of the splats, the alpha_min cut, where a pixel stops, and the clamps.
+Regularisers are added to value, gradient and H u; they have no part in G u.
+
+P' and P'' of every Gaussian, tile lists, final transmittances, g and a are computed once.  H U is then two passes over the
+pixels for K vectors together, the columns of U (p, K), laid out like `Gaussians.flat`; G U is one, and another for each vector.
+What is piecewise constant counts as constant: the order of the splats, the alpha_min cut, where a pixel stops, and the clamps.
+
+Shapes: p parameters, n splats, 9 numbers of a splat (place, inverse covariance, opacity, colour), h x w pixels of the image,
+H x W of whole tiles.
 
 Tangents and adjoints of splats are in the coordinates of `projection/whitening.py`.  On a GPU, products do not synchronise with
 the device.
@@ -62,7 +67,7 @@ class LinearizedView:
         self._raster = rasterize_view(gaussians, camera, background, settings)
         self._loss, self._couples = loss.linearize(self._raster.planes), loss.couples_pixels
         self._adjoint = self._raster.backward(self._loss.gradient)
-        self._index = self._raster.touched
+        self._index = self._raster.touched  # of the Gaussians that reach a tile before its pixels stop
         self._projection = backend_of(gaussians.flat).linearize_projection(
             gaussians, lens_of(camera, settings), self._raster.splats, self._adjoint.moments, self._index
         )
@@ -146,7 +151,7 @@ class LinearizedView:
     def hvp(
         self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, ssim_window: bool = True
     ) -> Float[Tensor, "p k"]:
-        """H U; added to total in place, where that is given.  ssim_window: False for l'' without its off-diagonal."""
+        """H U; added to total in place, where that is given.  ssim_window: False for the pixel-diagonal of l'' alone."""
         return self._regularizers.add_product(self._projection.vjp(self._adjoint_tangent(U, ssim_window), U, total), U)
 
     def ggn(
@@ -198,16 +203,16 @@ class LinearizedView:
         return tangent.backward_tangent(self._adjoint, self._loss_product(tangent, ssim_window))
 
     def _loss_product(self, tangent: Tangent, ssim_window: bool) -> Float[Tensor, "k 4 H W"]:
-        """l'' times the tangents of the image, which are overwritten."""
+        """l'' times the tangents of the image, in their place."""
         planes = tangent.planes
         if ssim_window:
             return self._loss.hvp(planes, out=planes)
         planes[:, :3] *= self._loss.diagonal
-        planes[:, 3] = 0
+        planes[:, 3] = 0  # l does not depend on alpha
         return planes
 
     def _pullback(self, adjoints: Sequence[Adjoint], total: Float[Tensor, "p k"] | None = None) -> Float[Tensor, "p k"]:
-        """P'^T times adjoints of the splats."""
+        """P'^T times adjoints of the splats, whose `moments` are cotangents of the 9 numbers."""
         return self._projection.vjp(torch.stack([adjoint.moments for adjoint in adjoints], dim=1), total=total)
 
 

@@ -37,11 +37,11 @@ class NothingInSight(InputError):
 
 @dataclass(frozen=True)
 class ActiveCounts:
-    """Numbers of Gaussians and parameters, given and active; L is exactly flat in the others.
+    """Numbers of Gaussians and parameters, given and active; images do not depend on the others.
 
-    active_gaussians: those that touch a pixel of some view.  parameters: stored numbers of all Gaussians.  active_parameters:
-    those of the active ones in the SH bands in use, less one for the length of each quaternion.  radial_quaternions: number of
-    such lengths.
+    active_gaussians: those that touch a pixel of some view; with keep_unseen all.  parameters: stored numbers of all Gaussians.
+    active_parameters: those of the active ones in the SH bands in use, less one for the length of each quaternion.
+    radial_quaternions: number of such lengths.
     """
 
     gaussians: int
@@ -63,8 +63,9 @@ class SceneObjective:
     It decides how long products take, not their values.
     keep_unseen: all Gaussians are active, for steps so long that Gaussians out of sight may come into sight.
 
-    active: the Gaussians that touch a pixel of some view, with unit quaternions; L is studied at `active.flat` (p,).  mask:
-    which of the given Gaussians are active.  counts: how many Gaussians and parameters are.
+    active: the Gaussians that touch a pixel of some view (with keep_unseen all), with unit quaternions; L is studied at
+    `active.flat` (p,), the lengths of the quaternions included.  mask: which of the given Gaussians are active.  counts: how
+    many Gaussians and parameters are.
 
     Raises NothingInSight where no Gaussian is seen, InputError where there is no view or no Gaussian, or a parameter or the
     background is not finite.
@@ -107,7 +108,7 @@ class SceneObjective:
             raise NothingInSight(f"expected Gaussians in sight, got {len(gaussians)} that no view sees")
         self.mask: Bool[Tensor, " n"] = torch.ones_like(seen) if keep_unseen else seen
         self.active = used.select(self.mask)
-        quats = self.active.quats
+        quats = self.active.quats  # in active.flat, which `select` has copied
         quats /= quats.norm(dim=1, keepdim=True)
         self._unseen = 0.0  # share of the inactive ones in R
         if loss_settings.opacity_reg or loss_settings.scale_reg:  # else they need not be copied
@@ -133,10 +134,11 @@ class SceneObjective:
         return {**dims, "quats": dims["quats"] - len(self.active)}
 
     def evaluate(self, flat: Float[Tensor, " p"]) -> tuple[float, Hashable]:
-        """(L, smooth piece) at other parameters of the active Gaussians.
+        """Evaluate (L, smooth piece) at other parameters of the active Gaussians.
 
-        Splats are sorted anew.  The smooth piece identifies the splats that each tile draws and their order: L may be
-        discontinuous between two points whose pieces differ.  Changes no state, and may run in several threads at once.
+        Splats are sorted anew.  The smooth piece identifies the splats that each tile draws and their order.  Between two
+        points whose pieces differ L may jump; where they are equal it still can, at alpha_min or a stop within a tile.  Changes
+        no state, and may run in several threads at once.
         """
         gaussians = self.active.with_flat(flat.to(self.active.flat.device))
         gaussians.require_finite()
@@ -186,8 +188,8 @@ class SceneObjective:
         )
 
     @cached_property
-    def losses(self) -> Float64[Tensor, " m"]:
-        """The loss of every view at the active Gaussians."""
+    def losses(self) -> Float64[Tensor, " M"]:
+        """l + R of every view at the active Gaussians."""
         return torch.tensor([view.value for view in self.linearized], dtype=torch.float64)
 
     @cached_property
@@ -201,10 +203,10 @@ class SceneObjective:
     def block_diagonal(
         self, *, gauss_newton: bool = False, approximate: bool = False, traced: bool = True
     ) -> PerGaussianBlocks:
-        """The block of every Gaussian in the Hessian of L, or in its Gauss-Newton part: exact, on the CPU.
+        """The block of every Gaussian in the Hessian of L, or in its Gauss-Newton part; exact ones with SSIM on the CPU only.
 
         approximate: with the diagonal of the loss's l'' in place of l'', without SSIM's window.
-        traced: with the traces of every view, `PerGaussianBlocks.views`.
+        traced: with the traces of every view by itself, `PerGaussianBlocks.views`; blocks are means over the views.
         """
         return self.block_diagonals(approximate=approximate, parts=(gauss_newton,), traced=traced)[0]
 

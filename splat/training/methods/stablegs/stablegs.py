@@ -2,14 +2,15 @@
 
     L = L_recon(Theta) + asp_weight L_recon(Theta') + vsp_weight mean_k l(I_k(Theta), I_k(Theta'))      Eqs. (15), (21), (22)
 
-Theta' is a probed copy of all Gaussians in all attributes (`attribute_probe.py`), new at every step.  The probe counts as
-constant: gradients in Theta' are pulled back to Theta through Eq. (14).  k are probed viewpoints (`viewpoint_probe.py`); l is
-the loss of training, between two renders.  There is no released code.
+Theta' is a probed copy of all Gaussians in all attributes (`attribute_probe.py`), new at every step.  Its steps count as
+constant: Eq. (14), Theta' = Theta + steps, gives gradients in Theta' to Theta as they are, those of quaternions turned back.  k
+are probed viewpoints (`viewpoint_probe.py`); l is the loss of training, between two renders.  There is no released code.
 
-Probing starts after `warm_up` steps.  A diagnosis every `every` steps computes the magnitudes rho from the traces of the
-Hessian's blocks over all training views, and the dominant occlusion edge of each view; both change slowly.  Density control is
-that of 3DGS, by the gradient of the sampled view only.  Where no training view sees a Gaussian, training continues with the
-last magnitudes and edges, or none.  The history notes this, and counts the probed viewpoints that see no Gaussian.
+Probing starts after `warm_up` steps.  A diagnosis every `every` steps computes the magnitudes rho, c / sqrt of the mean
+curvature of an attribute (Eq. (5)), from the traces of the Hessian's blocks over all training views, and the dominant occlusion
+edge of each view; both change slowly.  Density control is that of 3DGS, by the gradient of the sampled view only.  Where no
+training view sees a Gaussian, training continues with the last magnitudes and edges, or none.  The history notes this, and
+counts the probed viewpoints that see no Gaussian.
 
 What the paper leaves open (more in `attribute_probe.py` and `viewpoint_probe.py`):
 
@@ -17,7 +18,7 @@ What the paper leaves open (more in `attribute_probe.py` and `viewpoint_probe.py
     vsp_gradient           both       Eq. (22) is differentiated whole, and     "probed": the base render is a target; one
                                       Eq. (21) depends on Theta twice           backward pass less, another direction
     asp_views              sampled    Algorithm 1, lines 9 and 13               "all": Eq. (15); M renders a step, not 1
-    viewpoints             one        a term of Eq. (21) has its mean           "all": Sec. 3.4, K = M; 2 M renders, not 2
+    viewpoints             one        one drawn at random has Eq. (21) as mean   "all": Sec. 3.4, K = M; 2 M renders, not 2
     probe.rotation_unit    radian     omega of Eq. (9) is an angle              "quaternion": the unit of tr(H_q); turns twice
                                                                                 as far, up to the cap
     probe.dose             constants  one c = 0.01 for all (Sec. 4)             "equal": one rise of the loss for all
@@ -25,8 +26,8 @@ What the paper leaves open (more in `attribute_probe.py` and `viewpoint_probe.py
 
 The same expectation for less:
 
-    viewpoints = "one"     drawn independently of the sampled view: the probe depends on that view, and its own viewpoint alone
-                           would have another mean than Eq. (21)
+    viewpoints = "one"     drawn independently of the sampled view: the probe depends on that view, and always to pair the two
+                           would change the mean of Eq. (21)
     antithetic             two steps share the random numbers of the probe, with opposite signs: half the draws
     sampled_every          the sampled part of a trace (see Accuracy) is new in one of so many diagnoses; the others take its
                            last ratio to an exact part
@@ -36,8 +37,8 @@ Schedule.  The paper trains for 10,000 steps, 1,000 of them warm-up (Sec. 4, Alg
 `StableGS.scaled` multiplies the warm-up by T / 10,000; `landscape train` does so unless it is given.
 
 Accuracy.  tr H_b has an exact part and a sampled one (`splat/curvature/traces.py`).  The number of samples, from 8 to
-MOST_SAMPLES, is such that the 95% interval of rho is within `accuracy`; rho depends on the root of the trace.  A trace that
-almost cancels can miss the accuracy: its standard error is in the history.
+MOST_SAMPLES (four where `accuracy` is inf), is such that the 95% interval of rho is within `accuracy`; rho goes like the
+inverse root of the trace.  A trace that almost cancels can miss the accuracy: its standard error is in the history.
 
 Left out because it has no effect: the traces of attributes that are not probed; the probed copy where every rho is 0; each loss
 of weight 0; viewpoints that see nothing; the edges without edge rotation.
@@ -96,13 +97,13 @@ class StableGS(MethodSettings):
     warm_up: steps before probing starts; every: steps between two diagnoses (magnitudes and edges).
     asp_weight, vsp_weight: of the probed copy's loss, and of the agreement from probed viewpoints; 0 leaves it out, both 0 make
     it 3DGS.
-    traces: "exact": only the coupling between pixels is sampled, and only in one of sampled_every diagnoses; "paper": Eq. (6),
-    ten Gaussian samples a block, in each.
+    traces: "exact": only the coupling between pixels is sampled, and that in one of sampled_every diagnoses; "paper": Eq. (6),
+    ten normal samples a block, in every diagnosis.
     accuracy: of rho with "exact" traces, relative, with 95% confidence; inf takes the fewest samples, four.
     densify_after_warm_up: Gaussians are cloned, split and removed only after the warm-up.
     drop_share: p_max of DropGaussian, which leaves Gaussians out of the sampled view's render from the first step on; not the
     paper's, and 0 by default: with both weights 0 the training is DropGaussian's.
-    probe, viewpoint: of the attribute probes and of the viewpoint probes.  The others: see above.
+    probe, viewpoint: of the attribute probes and of the viewpoint probes.  The others: the table of the module.
     """
 
     name: Literal["stablegs"] = "stablegs"
@@ -152,8 +153,8 @@ class StableGSMethod(Method[StableGS]):
     """Training with StableGS.
 
     magnitudes: of the probed attributes, by name.  normals: (x, y) in pixels of each training view's edge, 0 where it has none.
-    coupling: of the sampled parts of traces, `coupling_ratios`.  pair: seeds of the probe whose opposite comes next, and the
-    number of parameters that it was drawn for.
+    coupling: of the sampled parts of traces, `coupling_ratios`.  pair: seeds of the last probe and its number of parameters,
+    where the next step takes the opposite probe.
     """
 
     def __init__(self, settings: StableGS, seed: int):
@@ -184,7 +185,8 @@ class StableGSMethod(Method[StableGS]):
             return base
         if since % settings.every == 0:
             self._diagnose(step, sampled=since // settings.every % settings.sampled_every == 0)
-        # without magnitudes the probed copy equals the original: same gradient, and no disagreement from any viewpoint
+        # without magnitudes the probed copy equals the original, and agrees with it from everywhere; the gradient at hand
+        # stands for that of its render, also with asp_views = "all" and where Gaussians are dropped
         if not self.magnitudes:
             return replace(base, gradient=(1 + settings.asp_weight) * base.gradient)
         draws, sign = self._draws(step.gaussians)
@@ -244,7 +246,7 @@ class StableGSMethod(Method[StableGS]):
                 self.normals = [dominant_edge(depth, alpha)[0] for depth, alpha in depths]
 
     def traces(self, objective: SceneObjective, *, sampled: bool = True) -> dict[str, TraceEstimate]:
-        """Traces of the Hessian's blocks of the probed attributes.  sampled: also what can be had from an earlier diagnosis."""
+        """Traces of the Hessian's blocks of the probed attributes.  sampled: the coupling of pixels anew, not by its last ratio."""
         settings, names = self.settings, self.settings.probe.on
         if not names:
             return {}
@@ -255,13 +257,14 @@ class StableGSMethod(Method[StableGS]):
         if settings.accuracy == inf:
             found = exact_traces(objective, self.generator, names=names, samples=LEAST_SAMPLES)
         else:
+            # rho goes like the inverse root
             enough = RhoAccuracy(rtol=2 * settings.accuracy, max_probes=MOST_SAMPLES)
             found = exact_traces(objective, self.generator, enough, names=names)
         self.coupling = coupling_ratios(objective, found)
         return found
 
     def _count_unseen(self, step: Step) -> None:
-        """Count a probed viewpoint that sees nothing, in a row of the history after the last diagnosis."""
+        """Count a probed viewpoint that sees nothing: one row of the history between two diagnoses."""
         if not self.history or "count" not in self.history[-1]:
             note = "probed viewpoints without a Gaussian in sight, until the next diagnosis"
             self.history.append({"step": step.number, "note": note, "count": 0})
