@@ -246,7 +246,7 @@ class StableGSMethod(Method[StableGS]):
                 self.normals = [dominant_edge(depth, alpha)[0] for depth, alpha in depths]
 
     def traces(self, objective: SceneObjective, *, sampled: bool = True) -> dict[str, TraceEstimate]:
-        """Traces of the Hessian's blocks of the probed attributes.  sampled: the coupling of pixels anew, not by its last ratio."""
+        """Traces of the Hessian's blocks of the probed attributes.  sampled: the coupling of pixels anew."""
         settings, names = self.settings, self.settings.probe.on
         if not names:
             return {}
