@@ -32,6 +32,8 @@ def quantity(value: float | None, error: float | None = None) -> str:
     ['(1.23 ± 0.04) × 10⁵', '−0.0123', '(0.3 ± 1.0) × 10⁻¹¹', '–']
     >>> quantity(105.598, 0.00035), quantity(20.0, 1.23).replace(HARD, " "), quantity(2.0, 0.004)
     ('106', '20.0 ± 1.2', '2.00')
+    >>> [quantity(*each).replace(HARD, " ") for each in ((9.96e-6, 2e-6), (5.0, 0.0998))]  # rounding adds a digit
+    ['(1.00 ± 0.20) × 10⁻⁵', '5.00 ± 0.10']
     """
     if value is None:
         return UNDETERMINED
@@ -42,9 +44,12 @@ def quantity(value: float | None, error: float | None = None) -> str:
     if not 0 < error < math.inf:
         return f"{_plain(value)}{PLUS_MINUS}?"
     exponent = _exponent(max(abs(value), error))
-    places = min(1 - _exponent(error), DIGITS - 1 - exponent)
+    places = min(1 - _exponent(error, 2), DIGITS - 1 - exponent)
     if Decimal(error).scaleb(places) < Decimal("0.5"):
         return _plain(value)
+    exponent = _exponent(
+        float(round(Decimal(max(abs(value), error)), places))
+    )  # to these places it may have a digit more
     if -3 <= exponent <= 3:
         return f"{_fixed(value, 0, places)}{PLUS_MINUS}{_fixed(error, 0, places)}"
     places += exponent
@@ -55,8 +60,8 @@ def quantity(value: float | None, error: float | None = None) -> str:
 def rough(value: float | None) -> str:
     """A number in two digits, for a sentence.
 
-    >>> [text.replace(HARD, " ") for text in map(rough, (27.438, 163.0, -0.16863, 2.5e-5, None))]
-    ['27', '160', '−0.17', '2.5 × 10⁻⁵', '–']
+    >>> [text.replace(HARD, " ") for text in map(rough, (27.438, 163.0, -0.16863, 2.5e-5, 9.98e-4, None))]
+    ['27', '160', '−0.17', '2.5 × 10⁻⁵', '0.0010', '–']
     """
     return UNDETERMINED if value is None else _plain(value, 2) if math.isfinite(value) else quantity(value)
 
@@ -154,7 +159,7 @@ def unit_suffix(exponent: int) -> str:
 
 def _plain(value: float, digits: int = DIGITS) -> str:
     """`value` with this many significant digits."""
-    exponent = _exponent(value)
+    exponent = _exponent(value, digits)
     if value == 0:
         return "0"
     if -3 <= exponent <= 3:
@@ -168,9 +173,9 @@ def _fixed(value: float, exponent: int, places: int) -> str:
     return f"{scaled:.{max(0, places)}f}".replace("-", "−")
 
 
-def _exponent(value: float) -> int:
-    """Decimal exponent of the leading digit after rounding to three digits; 0 for 0."""
-    return int(f"{value:.2e}".partition("e")[2])
+def _exponent(value: float, digits: int = DIGITS) -> int:
+    """Decimal exponent of the leading digit after rounding to so many digits; 0 for 0."""
+    return int(f"{value:.{digits - 1}e}".partition("e")[2])
 
 
 class Shade(Struct, frozen=True, kw_only=True):
