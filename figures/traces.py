@@ -2,7 +2,8 @@
 
 Traces have the units of their attributes, so they do not compare.  What is drawn is s^2 tr / 2 as a share of the loss: the mean
 change of the loss by curvature when every parameter of the attribute moves by +-s at random, s the length of the optimiser's
-first step.  Of a record without s the traces themselves are drawn, and the title says that they do not compare.
+first step; a diamond where renders of such steps have it.  Of a record without s the traces themselves are drawn, and the title
+says that they do not compare.
 
 Magnitudes are on a logarithmic axis; the sign is in the marker (filled circle: positive; open square: negative; open
 diamond: the interval does not decide it).  An arrow at the left edge is a zero, or an interval that reaches 0.
@@ -25,7 +26,7 @@ from analysis.records.quantities import measured, power_of_ten, rough
 from analysis.records.records import ProbeRecord, Record
 from analysis.records.schema import Trace
 from figures.scripts import script
-from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, style
+from figures.style import NEGATIVE, ORANGE, POSITIVE, UNDETERMINED, literal, new_figure, style
 
 SIGNS: dict[str, dict[str, Any]] = {
     "positive": {"color": POSITIVE, "marker": "o", "markerfacecolor": POSITIVE},
@@ -47,7 +48,12 @@ def draw(record: Record[ProbeRecord]) -> Figure:
         if shares:
             _draw_traces(axes, {name: scaled(entry, shares[name]) for name, entry in entries.items()},
                          {name: shares[name] * np.asarray(found) for name, found in samples.items()})  # fmt: skip
-            axes.set_xlabel("change of the loss by one random step\nas long as the optimiser's first (share)")
+            for name, (rise, _) in (record.data.step_rises or {}).items():
+                axes.plot([abs(rise) / (record.data.objective.value or 1.0)], [list(entries).index(name)], "D", color=ORANGE,
+                          markersize=4, zorder=6)  # fmt: skip
+            axes.set_xlabel(
+                "change of the loss by one random step as long as the\noptimiser's first (share): by curvature; ◆ rendered"
+            )
         else:
             _draw_traces(axes, entries, samples)
             axes.set_xlabel("|trace|; rows have units of their own\nand do not compare")
@@ -68,9 +74,12 @@ def _title(data: ProbeRecord) -> str:
     if len(shares_per_trace(data)) < 2:
         return "Curvature of each attribute"
     if (found := largest_steps(data)) is None:
-        return "No attribute is the steepest for certain"
+        return "In no attribute a step changes the loss most for certain"
     first, second, ratio = found
-    text = f"Per step, {attribute_name(first)} is steepest: {rough(ratio)} × {attribute_name(second)}"
+    rendered = "rendered, " if data.step_rises else "by curvature alone, "
+    text = (
+        f"A step in {attribute_name(first)} changes the loss most:\n{rendered}{rough(ratio)} × {attribute_name(second)}"
+    )
     return f"{text}\n(beside the names: traces, each in its own unit)"
 
 

@@ -7,6 +7,7 @@ optimiser    D the learning rate of every parameter at the first step: curvature
 A curvature unit is a step along one direction: that within which the curvature alone changes the loss by RISE of it.
 """
 
+import sys
 from dataclasses import asdict
 from typing import Literal
 
@@ -14,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.results import sampling_error
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
 from splat.training.state import LearningRates, learning_rates, position_rate
@@ -52,6 +54,27 @@ def step_lengths(rates: LearningRates, extent: float) -> dict[str, float]:
     """
     lengths = asdict(rates) | {"means": rates.position * extent, "sh": rates.sh_constant}
     return {name: lengths[name] for name in ATTRIBUTES}
+
+
+def step_rises(
+    objective: SceneObjective, steps: Float[Tensor, " p"], generator: torch.Generator, draws: int = 3
+) -> dict[str, tuple[float, float]]:
+    """Rise of the loss, by attribute, when each of its parameters moves by +-steps at random: as rendered, no model of it.
+
+    The mean over pairs of such a step and its opposite, in which the slope cancels, and its error (`sampling_error`).  It takes
+    2 draws losses an attribute, and one.
+    """
+    theta, found = objective.active.flat, {}
+    base = objective.loss(theta)
+    for name, rows in objective.blocks.items():
+        rises = torch.zeros(draws, dtype=torch.float64)
+        for i in range(draws):
+            step = torch.zeros_like(theta)
+            signs = torch.empty_like(theta[rows]).bernoulli_(generator=generator) * 2 - 1
+            step[rows] = steps[rows] * signs
+            rises[i] = (objective.loss(theta + step) + objective.loss(theta - step)) / 2 - base
+        found[name] = float(rises.mean()), sampling_error(rises, sys.maxsize) or 0.0
+    return found
 
 
 def optimiser_units(objective: SceneObjective, rates: LearningRates, extent: float) -> Float[Tensor, " p"]:

@@ -24,7 +24,7 @@ from analysis.console.plain import say
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.measures.memory import expected_peak, size_of
-from analysis.measures.units import step_lengths
+from analysis.measures.units import optimiser_units, step_lengths
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.plan import expected_seconds, seconds_of_render
@@ -93,15 +93,15 @@ def _run(
     # the folder is opened first, so that one that cannot be written is refused before anything is measured
     with record_folder(out) if writes else nullcontext() as folder, stages, _kept(unfinished, command, console):
         generator = torch.Generator(device).manual_seed(options.seed)
-        lengths = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
+        rates = checkpoint.training.config.rates, checkpoint.training.extent
         found = measure(
-            objective, settings, lengths, generator, stages, None if ranks else unfinished, identity,
+            objective, settings, optimiser_units(objective, *rates), generator, stages, None if ranks else unfinished, identity,
             deadline=begun + limit - DRAWING, population=checkpoint.all_views, ranks=ranks or ALONE,
         )  # fmt: skip
         origin = provenance_of(made, subject, command)
         data = probe_record(found, objective, origin, stages.timing)
         arrays = probe_arrays(found.traces, found.ends, found.density, found.plane)
-        data.steps = lengths
+        data.steps = step_lengths(*rates)
         if families is not None:
             data = _with_families(data, arrays, families, objective, checkpoint, generator, stages, found.ends)
         data.notes += checkpoint.assumptions

@@ -34,13 +34,14 @@ class Search:
 class Rendered:
     """Losses at finite steps along the eigenvectors of both ends (None of an eigenvalue 0), and the Gaussians that carry these.
 
-    steps: the optimiser's along each; kinks: see `analysis.measures.steepest`.
+    steps: the optimiser's along each; kinks: see `analysis.measures.steepest`; rises: `analysis.measures.units.step_rises`.
     """
 
     ends: tuple[FiniteProbe | None, FiniteProbe | None]
     steps: tuple[float, float]
     kinks: tuple[float, float]
     carriers: list[Carries]
+    rises: dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@
     eigenvalues         the two largest and the smallest, from the start vectors of `splat.curvature.block_eigenvectors`
     renders             the second difference of the loss along the eigenvectors of both ends, at steps that double, from a part
                         of the optimiser's to one at which the curvature alone changes the loss by 1%; the Gaussian that
-                        carries each end
+                        carries each end; the loss after random steps of the optimiser in each attribute
     slice               the loss over the plane of the first two eigenvectors: rendered where needed, interpolated elsewhere
     density *           stochastic Lanczos quadrature, for sums of |lambda|; the Krylov spaces of its first runs
                         contain the iterates of the paper's power iteration
@@ -21,7 +21,7 @@ their accuracy or at a limit on products; their results say which.  Time ends th
 seed alone, also those of stages kept from an earlier run.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil, inf, log2
@@ -35,9 +35,10 @@ from analysis.console.kept import Kept
 from analysis.console.stages import Stages
 from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import ProductCheck, check_against_gradient
-from analysis.measures.localization import mass_shares, masses, participation
+from analysis.measures.localization import masses, participation
 from analysis.measures.memory import basis_within, vectors_within
 from analysis.measures.steepest import heaviest, kink_curvature
+from analysis.measures.units import step_rises
 from analysis.probe.measured import LeftOut, Measured, PlaneSlice, Rendered, Search, Spectrum
 from analysis.probe.plan import MOST_AT_ONCE
 from analysis.probe.settings import FEWEST_STEPS, TEN, ProbeSettings
@@ -103,7 +104,7 @@ MOST_SAMPLES = 64  # of a trace on a CPU: more would take longer than summing th
 def measure(
     objective: SceneObjective,
     settings: ProbeSettings,
-    lengths: Mapping[str, float],
+    steps: Float[Tensor, " p"],
     generator: torch.Generator,
     stages: Stages,
     folder: Path | None = None,
@@ -114,7 +115,7 @@ def measure(
 ) -> Measured:
     """Run every stage.
 
-    lengths: of the optimiser's first step in a parameter, by attribute.  folder, identity, deadline: see `Kept`.  population:
+    steps: the optimiser's first in each parameter.  folder, identity, deadline: see `Kept`.  population:
     number of training views, where the objective has fewer.  ranks: processes that all measure the same, and share the views of
     the operator's products.
     """
@@ -125,7 +126,7 @@ def measure(
         gradient_check = check_against_gradient(at.hessian, spawn(generator), report, settings.checked_views)
     of_checks = at.work()
     kept = Kept(stages, generator, STAGES, at.work, folder, identity, deadline)
-    return _all_stages(at, lengths, kept, operator_check, gradient_check, of_checks, population)
+    return _all_stages(at, steps, kept, operator_check, gradient_check, of_checks, population)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +172,7 @@ def _compile_blocks(objective: SceneObjective) -> None:
 
 def _all_stages(
     at: _Point,
-    lengths: Mapping[str, float],
+    steps: Float[Tensor, " p"],
     kept: Kept,
     operator_check: OperatorCheck,
     gradient_check: ProductCheck,
@@ -184,7 +185,7 @@ def _all_stages(
     search = kept.run("eigenvalues", Search, partial(_ends, at, kept), ends_in_time=True)
     assert traces is not None and search is not None  # stages that end in time always return something
     ends = search.ends
-    rendered = kept.run("renders", Rendered, partial(_rendered, at, ends, lengths))
+    rendered = kept.run("renders", Rendered, partial(_rendered, at, ends, steps))
     plane = kept.run("slice", PlaneSlice | None, partial(_plane, at, ends))  # pyright: ignore[reportArgumentType]
     spectrum = power = finite = depth = None
     if settings.density_matvecs:
@@ -315,30 +316,26 @@ def _finite(at: _Point, ends: EigenEnds, _: torch.Generator, report: Progress, _
 
 
 def _rendered(
-    at: _Point,
-    ends: EigenEnds,
-    lengths: Mapping[str, float],
-    generator: torch.Generator,
-    report: Progress,
-    _: list[str],
+    at: _Point, ends: EigenEnds, steps: Float[Tensor, " p"], generator: torch.Generator, report: Progress, _: list[str]
 ) -> Rendered:
     """Renders along both ends, and who carries these."""
-    probes, steps, objective = [], [], at.objective
+    probes, lengths, objective = [], [], at.objective
     pairs = (ends.largest, ends.smallest)
     for pair in pairs:
-        shares, value = mass_shares(pair.vectors[:, 0], objective.blocks), float(pair.values[0])
+        value = float(pair.values[0])
         # root mean square of d . v over random signs of d: the root of the sum of v_i^2 d_i^2
-        step = sum(share * lengths[name] ** 2 for name, share in shares.items()) ** 0.5
+        step = float(torch.linalg.vector_norm((pair.vectors[:, 0] * steps).double()))
         reach = curvature_reach(value, RISE * at.value) if value and at.value > 0 else step
         doublings = min(max(ceil(log2(reach / step)), 1), MOST_DOUBLINGS) if step else 0
         along = [step * 2.0**k for k in range(-HALVINGS, doublings + 1)]
         probe = partial(finite_probe, objective.evaluate, objective.active.flat, pair.vectors[:, 0], at.operator)
         probes.append(probe(along, report, FEW_POINTS) if value and step else None)
-        steps.append(step)
+        lengths.append(step)
     vectors = [pair.vectors[:, 0] for pair in pairs]
     kinks = [kink_curvature(objective, vector) for vector in vectors]
     carriers = heaviest(objective, vectors, generator)
-    return Rendered((probes[0], probes[1]), (steps[0], steps[1]), (kinks[0], kinks[1]), carriers)
+    rises = step_rises(objective, steps, generator)
+    return Rendered((probes[0], probes[1]), (lengths[0], lengths[1]), (kinks[0], kinks[1]), carriers, rises)
 
 
 def _depth(at: _Point, accuracy: TraceSettings, generator: torch.Generator, report: Progress, _: list[str]) -> Depth:

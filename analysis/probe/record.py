@@ -47,6 +47,7 @@ def probe_record(
         finite_probe=found.finite and finite_record(found.finite),
         depth=found.depth,
         block_shares=UNSET if found.shares is None else [_block_share(one) for one in found.shares],
+        step_rises=UNSET if found.rendered is None else found.rendered.rises,
         slice=found.plane and slice_record(found.plane, found.ends.largest),
         counts=_counts(found, objective),
         checks=_checks(found, objective.counts.views),

@@ -97,18 +97,29 @@ def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
     return {name: data.steps[name] ** 2 / (2 * loss) for name in data.traces}
 
 
+def changes_by_steps(data: ProbeRecord) -> dict[str, tuple[float, float]]:
+    """The least and the largest size, by attribute, of the change of the loss in such a step: rendered, in units of the loss,
+    where the record has renders; else by curvature alone, as a share.  The largest first; empty where not known."""
+    if data.step_rises:
+        ends = {
+            n: (max(abs(rise) - 2 * error, 0.0), abs(rise) + 2 * error) for n, (rise, error) in data.step_rises.items()
+        }
+    else:
+        shares, traces = shares_per_trace(data), data.traces
+        ends = {name: tuple(share * x for x in traces[name].magnitudes) for name, share in shares.items()}
+    return dict(sorted(ends.items(), key=lambda each: -sum(each[1])))
+
+
 def largest_steps(data: ProbeRecord) -> tuple[str, str, float] | None:
-    """The two attributes whose curvature changes the loss most in such a step (`shares_per_trace`), and the ratio of the
-    changes; None where not known, or where the errors leave open whether another than the first one's is as large."""
-    shares, traces = shares_per_trace(data), data.traces
-    if len(shares) < 2:
+    """The two attributes in which such a step changes the loss most, and the ratio of the changes; None where not known, or
+    where the errors leave open whether another than the first one's is as large."""
+    ends = changes_by_steps(data)
+    if len(ends) < 2:
         return None
-    least, largest = ({name: share * traces[name].magnitudes[i] for name, share in shares.items()} for i in (0, 1))
-    first, second, *_ = sorted(shares, key=lambda name: -least[name])
-    if not least[first] > max(largest[name] for name in shares if name != first) > 0:
+    (first, (least, most)), (second, other), *rest = ends.items()
+    if not least > max(high for _, (_, high) in [(second, other), *rest]) > 0:
         return None
-    changes = [sum(abs(shares[name] * x) for x in traces[name].interval) for name in (first, second)]
-    return first, second, changes[0] / changes[1]
+    return first, second, (least + most) / sum(other)
 
 
 def _of_ends(data: ProbeRecord) -> list[Line]:

@@ -121,7 +121,8 @@ class ProbeRecord(Struct, kw_only=True):
     """Results of `landscape probe`.
 
     traces: by attribute (means, log_scales, quats, opacity_logits, sh).  finite_probe, depth, slice: None where left out.
-    steps: length of the optimiser's first step in a parameter, by attribute.  skipped: by the kind of work.  checks: symmetry,
+    steps: length of the optimiser's first step in a parameter, by attribute.  step_rises: of the loss in such steps with random
+    signs, rendered, with its error (`analysis.measures.units`).  skipped: by the kind of work.  checks: symmetry,
     round_off, finiteness, finite_difference.  timing: stage -> seconds, in the order run, and "total".  notes: sentences on
     what was skipped, capped, or not reached.  arrays: group -> name -> shape.
     """
@@ -140,6 +141,7 @@ class ProbeRecord(Struct, kw_only=True):
     depth: schema.Depth | None = None
     block_shares: Maybe[list[schema.BlockShare]] = UNSET
     steps: Maybe[dict[str, float]] = UNSET
+    step_rises: Maybe[dict[str, tuple[float, float]]] = UNSET
     slice: schema.Slice | None = None
     counts: Counts
     checks: dict[str, Check]

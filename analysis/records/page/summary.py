@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from analysis.records.findings import Line, findings, is_loose, largest_steps, shares_per_trace
+from analysis.records.findings import Line, changes_by_steps, findings, is_loose, largest_steps
 from analysis.records.quantities import UNDETERMINED, apart, percent, rough, solved
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import Eigenvalue
@@ -100,7 +100,7 @@ def _end(end: Eigenvalue) -> str:
     if renders and renders.optimiser_step and (value > 0 or renders.confirmed):
         at = renders.at_step
         over = "hidden by round-off" if at is None else rough(at * value)
-        kinks = f", where kinks of L1 add {rough(renders.kinks)}" if renders.kinks else ""
+        kinks = f", of it about {rough(renders.kinks)} by kinks of L1" if renders.kinks else ""
         notes.insert(0, f"{over} over the optimiser's step{kinks}")
     text = f"{solved(value, end.residual)}{apart(end.views_error)} ({', '.join(notes)})"
     return f"{text}{_carrier(end)}; {_rendered(end)}"
@@ -113,7 +113,7 @@ def _carrier(end: Eigenvalue) -> str:
         return ""
     random = f"(of a random direction {percent(carrier.random_share)})"
     if carrier.share < CARRIED:
-        return f": over many Gaussians, at most {percent(carrier.share)} on one {random}"
+        return f": over several Gaussians, at most {percent(carrier.share)} on one {random}"
     shape = f"{carrier.shape}, " if carrier.shape else ""
     text = f": {percent(carrier.share)} on Gaussian {carrier.gaussian:,} {random}, {shape}{MOVED[carrier.attribute]}"
     if carrier.wide:
@@ -131,33 +131,29 @@ def _rendered(end: Eigenvalue) -> str:
     if not renders:
         return "not rendered"
     if renders.confirmed:
-        return f"renders agree from {rough(renders.low)} to {rough(renders.high)}"
+        return f"renders agree within a factor of 2 from {rough(renders.low)} to {rough(renders.high)}"
     if renders.confirmed is None:
         return "not resolved: round-off hides it in renders"
     value, why = end.value or 0.0, ""
     if renders.kinks > abs(value):
-        why = f", as kinks of L1, which it leaves out, have {rough(renders.kinks)}"
+        why = f", as kinks of L1, which the eigenvalue leaves out, curve by {rough(renders.kinks)}"
+    elif (ratio := renders.at_step) is not None:
+        why = f", by which it is {rough(ratio * value)} over the optimiser's step"
     return f"not confirmed by renders{why}" + (": no saddle is claimed" if value < 0 else "")
 
 
 def _step(data: ProbeRecord) -> str:
     """Attributes by the change of the loss in a random step of the optimiser; ≈ where errors leave the order open."""
-    shares, traces = shares_per_trace(data), data.traces
-    if not shares:
+    if not (ends := changes_by_steps(data)):
         return ""
-
-    def change(name: str, end: int) -> float:
-        return shares[name] * traces[name].magnitudes[end]
-
-    ranked = sorted(shares, key=lambda name: -shares[name] * abs(traces[name].value or 0.0))
-    parts = [SHORT.get(name, name) for name in ranked]
-    joined = [", then " if change(before, 0) > change(name, 1) else " ≈ " for before, name in pairwise(ranked)]
+    parts = [SHORT.get(name, name) for name in ends]
+    joined = [", then " if before[0] > after[1] else " ≈ " for before, after in pairwise(ends.values())]
+    by = "" if data.step_rises else ", by curvature alone"
     if first := largest_steps(data):
         text = f"of the optimiser in {parts[0]} changes the loss {rough(first[2])} times as much as in {parts[1]}"
-        return text + "".join(map("".join, zip(joined[1:], parts[2:], strict=True)))
-    return f"of the optimiser changes the loss most in {parts[0]}" + "".join(
-        map("".join, zip(joined, parts[1:], strict=True))
-    )
+        return text + "".join(map("".join, zip(joined[1:], parts[2:], strict=True))) + by
+    rest = "".join(map("".join, zip(joined, parts[1:], strict=True)))
+    return f"of the optimiser changes the loss most in {parts[0]}{rest}{by}"
 
 
 def _spread(data: ProbeRecord) -> str:
@@ -166,6 +162,7 @@ def _spread(data: ProbeRecord) -> str:
     if known:
         ends = [rough(end) for end in (known.half.low, known.half.high)]
         among = ends[0] if ends[0] == ends[1] else " to ".join(ends)
+        among = f"at most {ends[1]}" if (known.half.low or 0.0) < 1 else among
         parts.append(f"half of all curvature lies in {among} of {data.counts.active_parameters:,} directions")
     if ratio and ratio.value is not None and not is_loose(ratio):
         parts.append(f"participation ratio {rough(ratio.value)}")

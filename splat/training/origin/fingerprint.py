@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from splat.model.gaussians import Gaussians
     from splat.scenes.view import Frame
 
-FORMULAS = 5
+FORMULAS = 6
 SAME = 1e-9  # of the cameras' distances: what round-off of double precision may move, on another machine
 SHOWN = 3  # views that a sentence names
 Vector = tuple[float, float, float]

@@ -6,7 +6,7 @@ from math import log
 import pytest
 import torch
 
-from analysis.measures.units import optimiser_units, scene_size, scene_units
+from analysis.measures.units import optimiser_units, scene_size, scene_units, step_rises
 from landscape import ScaledOperator
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
@@ -15,6 +15,7 @@ from splat.model.gaussians import Gaussians
 from splat.training.state import LearningRates
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import random_gaussians, random_like
+from tests.splat.tiny import SMOOTH, tiny_gaussians, tiny_views
 from tests.splat.tolerances import relative_error
 
 
@@ -84,3 +85,20 @@ def test_the_optimisers_units_are_its_rates_at_the_first_step():
     D = objective.active.with_flat(optimiser_units(objective, LearningRates(), extent=2.0))
     assert (D.means == 2 * 1.6e-4).all() and (D.log_scales == 5e-3).all() and (D.quats == 1e-3).all()
     assert (D.opacity_logits == 0.05).all() and (D.sh[:, 0] == 2.5e-3).all() and (D.sh[:, 1:] == 2.5e-3 / 20).all()
+
+
+def test_the_rise_by_random_steps_is_half_the_trace_in_the_optimisers_units_where_the_loss_is_quadratic():
+    scene = SceneObjective(
+        tiny_gaussians(dtype=torch.float64),
+        tiny_views(torch.float64),
+        LossSettings("l2", ssim_weight=0.0),
+        None,
+        SMOOTH,
+    )
+    D = 0.01 * optimiser_units(scene, LearningRates(), 1.0)  # so short that nothing but curvature is left
+    found = step_rises(scene, D, torch.Generator().manual_seed(0), draws=40)
+    H = SceneHessian(scene)
+    for name, rows in scene.blocks.items():
+        diagonal = H.apply(torch.eye(H.dim, dtype=torch.float64)[:, rows])[rows].diagonal()
+        exact, (rise, error) = float((diagonal * D[rows].square()).sum()) / 2, found[name]
+        assert 0 < error < 0.5 * abs(exact) and abs(rise - exact) < 3 * error, name

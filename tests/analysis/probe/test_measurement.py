@@ -7,7 +7,7 @@ import torch
 
 from analysis.console.stages import Stages
 from analysis.measures.per_attribute import PerAttributeOptions
-from analysis.measures.units import step_lengths
+from analysis.measures.units import optimiser_units
 from analysis.probe import measurement
 from analysis.probe.measurement import measure
 from analysis.probe.plan import expected_seconds
@@ -25,7 +25,9 @@ from splat.training.state import LearningRates
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import random_gaussians
 
-LENGTHS = step_lengths(LearningRates(), 1.0)
+
+def steps(objective):
+    return optimiser_units(objective, LearningRates(), 1.0)
 
 
 def test_kernels_are_compiled_before_the_stages_that_are_kept_and_blocks_made_once(monkeypatch):
@@ -49,7 +51,7 @@ def test_kernels_are_compiled_before_the_stages_that_are_kept_and_blocks_made_on
     counted(measurement, "Kept")
     objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
     settings = replace(ProbeSettings.quick(), slice_points=5, block_ssim_window=True)
-    found = measure(objective, settings, LENGTHS, torch.Generator().manual_seed(0), Stages())
+    found = measure(objective, settings, steps(objective), torch.Generator().manual_seed(0), Stages())
     first = calls[: calls.index("Kept")]
     assert {"block_diagonal", "evaluate", "exact", "check_against_gradient"} <= {*first}
     assert calls.count("block_diagonal") == 1 and calls.count("gauss_newton") == 1
@@ -64,7 +66,7 @@ def test_the_slices_model_has_the_hessian_between_its_directions():
         random_gaussians(15, 1, logit=1.0).to(torch.float64), two_views(), LossSettings(), BACKGROUND.double()
     )
     settings = replace(ProbeSettings.quick(), slice_points=5)
-    found = measure(objective, settings, LENGTHS, torch.Generator().manual_seed(0), Stages())
+    found = measure(objective, settings, steps(objective), torch.Generator().manual_seed(0), Stages())
     assert found.plane is not None and found.plane.slice.curvature is not None
     E = found.ends.largest.vectors[:, :2]
     between = E.T @ SceneHessian(objective).apply(E)
@@ -104,7 +106,7 @@ def test_the_paper_s_power_iteration_is_read_from_the_density_without_products()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measurement, "spectral_density", watched)
-        found = measure(objective, settings, LENGTHS, torch.Generator().manual_seed(0), Stages())
+        found = measure(objective, settings, steps(objective), torch.Generator().manual_seed(0), Stages())
     assert found.power is not None and found.power.matvecs == 0 and len(seen[0].T) >= 8
     starts = [run.Q[:, 0].contiguous() for run in (seen[0], seen[-1])]
     allowed = replace(settings.power, max_matvecs=len(seen[0].T))
@@ -134,7 +136,7 @@ def test_traces_that_samples_do_not_resolve_are_exact():
     few = replace(ProbeSettings.quick(), slice_points=5, trace_samples=None)
     for rtol, reason in ((1e-9, "exact"), (1e3, "tolerance")):
         settings = replace(few, traces=TraceSettings(rtol=rtol, max_probes=2048))
-        found = measure(objective, settings, LENGTHS, torch.Generator().manual_seed(0), Stages()).traces
+        found = measure(objective, settings, steps(objective), torch.Generator().manual_seed(0), Stages()).traces
         assert {trace.reason for trace in found.values()} == {reason}
         for name, exact in block_traces(objective).items():
             assert found[name].value == exact.value or reason == "tolerance"

@@ -173,7 +173,11 @@ def test_the_summary_says_of_both_ends_what_renders_say_and_who_carries_them(rec
         mass = int(masses(vector, dense[0].active).argmax())
         assert end.carrier.gaussian == int(dense[0].mask.nonzero()[mass, 0])
         assert " of " in end.carrier.shape
-        agree = {True: "renders agree from", False: "not confirmed by renders", None: "not resolved"}
+        agree = {
+            True: "renders agree within a factor of 2 from",
+            False: "not confirmed by renders",
+            None: "not resolved",
+        }
         assert agree[end.renders.confirmed] in lines[name] and "one training" in lines[name]
 
 
