@@ -84,7 +84,7 @@ def _title(data: ProbeRecord) -> str:
 
 
 def _draw_traces(axes: Axes, entries: dict[str, Trace], samples: dict[str, np.ndarray]) -> None:
-    magnitudes = [abs(n) for e in entries.values() for n in (e.value, e.standard_error) if _drawable(n)]
+    magnitudes = [abs(e.value) for e in entries.values() if _drawable(e.value)]
     left = _logarithmic(axes, magnitudes)
     for row, (name, entry) in enumerate(entries.items()):
         look = SIGNS[_sign(entry)]

@@ -43,7 +43,7 @@ def told(data: ProbeRecord) -> dict[str, str]:
     if doubtful := _doubtful(data):
         words = f"the check of {' and '.join(doubtful)} failed, which puts every curvature in doubt: none is told"
         lines = {"scene": lines["scene"], "curvature": words}
-    lines |= {"checks": _checks(data) + (f"; {total:.0f} s" if (total := data.timing.get("total")) else "")}
+    lines |= {"checks": _checks(data), "time": f"{total:.0f} s" if (total := data.timing.get("total")) else ""}
     return {name: text for name, text in lines.items() if text}
 
 
@@ -123,7 +123,7 @@ def _carrier(end: Eigenvalue) -> str:
         )
     if carrier.found < 2:
         return text
-    return f"{text}; none of the first {carrier.found} eigenvectors from this end lies on more than ten Gaussians"
+    return f"{text}; each of the first {carrier.found} eigenvectors from this end lies on at most ten Gaussians"
 
 
 def _rendered(end: Eigenvalue) -> str:

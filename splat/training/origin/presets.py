@@ -108,5 +108,6 @@ def preset_of(said: str | None, asked: str | None) -> tuple[str, str]:
         return name, "asked for" if asked else "the file"
     found = f"the file, which says {said!r}" if asked is None and said else (asked or "nothing in the file")
     raise InputError(
-        f"expected --trained-by with one of {', '.join(PRESETS)}, whose conventions to follow, got {found}"
+        f"expected --trained-by with one of {', '.join(PRESETS)}, whose conventions to follow, got {found}; of the "
+        "original 3DGS: graphdeco"
     )

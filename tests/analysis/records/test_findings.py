@@ -60,7 +60,7 @@ def test_a_check_that_failed_leaves_no_number_that_it_puts_in_doubt():
     data, _ = synthetic()
     data["checks"]["finite_difference"] |= {"value": 20.3, "bound": 4.77e-4, "passed": False}
     lines = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))
-    assert set(lines) == {"scene", "curvature", "checks", "report"}
+    assert set(lines) == {"scene", "curvature", "checks", "time", "report"}
     assert lines["curvature"] == (
         "the check of finite difference failed, which puts every curvature in doubt: none is told"
     )
@@ -72,7 +72,7 @@ def test_a_check_that_failed_leaves_no_number_that_it_puts_in_doubt():
     ("confirmed", "ratio", "said"),
     [
         (True, 1.5, "renders agree within a factor of 2 from 0.0010 to 0.0040"),
-        (False, -1.5, "not confirmed by renders: no saddle is claimed"),
+        (False, -1.5, "not confirmed by renders, by which it is 330 over the optimiser's step: no saddle is claimed"),
         (None, 1.5, "not resolved: round-off hides it in renders"),
     ],
 )
@@ -90,7 +90,7 @@ def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, wide):
     over = ", one training" if not confirmed else "330 over the optimiser's step, one training"
     assert lines["negative"].startswith("−220 (" + over.removeprefix(", ").replace("330", "−330"))
     who = "90% on Gaussian 3,739 (of a random direction 0.2%), a needle, 158 : 1 in the picture, turned; "
-    other = "none of the first 10 eigenvectors from this end lies on more than ten Gaussians"
+    other = "each of the first 10 eigenvectors from this end lies on at most ten Gaussians"
     other = "number 4 from this end (−120) is the first eigenvector on more than ten Gaussians" if wide else other
     assert lines["negative"].endswith(f"{who}{other}; {said}")
     assert "λ max / λ min" not in str(lines)

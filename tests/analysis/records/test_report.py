@@ -355,10 +355,10 @@ def test_the_title_and_the_checks_say_what_is_known(tmp_path):
     text = Page(page(tmp_path / "whole", data, arrays)).text
     assert (
         "Loss landscape of fern, 3 views, 2,000 steps" in text
-        and "checks 2 of 3 passed, not finite difference; 45 s" in text
+        and "checks 2 of 3 passed, not finite difference time 45 s" in text
     )
     del data["provenance"]["scene"], data["provenance"]["iteration"]
     data["counts"] |= {"views": 1}
     data["checks"] = {"symmetry": data["checks"]["symmetry"]}
     text = Page(page(tmp_path / "less", data, arrays)).text
-    assert "Loss landscape of a checkpoint, 1 view " in text and "checks all 1 passed; 45 s" in text
+    assert "Loss landscape of a checkpoint, 1 view " in text and "checks all 1 passed time 45 s" in text
