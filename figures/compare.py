@@ -3,7 +3,7 @@
 compare_traces      |trace| of every attribute with its interval; filled: positive, open: negative, crossed: not decided
 compare_densities   the share of directions whose curvature is at most -x (left) or at least x (right), both axes logarithmic;
                     means over the start vectors of the quadrature, thin: each of these alone; dashed: the ends of the
-                    spectrum
+                    spectrum; without nodes that are not resolved from 0
 compare_slices      the planes of the two steepest directions, cut to the steps that all slices reach along both, with the same
                     levels; dots: renders
 compare_sections    the loss along each of these directions, as far as each slice goes
@@ -27,6 +27,7 @@ from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.run_files import COMPARISON, read_comparison
 from analysis.records.schema import Trace
+from figures.density import at_zero, unresolved_share
 from figures.plane import Plane, plane
 from figures.scripts import folder_script
 from figures.slice2d import RENDERED
@@ -90,7 +91,7 @@ def draw_densities(records: Records) -> Figure:
             spectrum, found = record.arrays.get("spectrum", {}), record.data.eigenvalues
             for axes, sign, end in zip(panels, (-1, 1), (found.min, found.max), strict=True):
                 if "nodes" in spectrum and (sign * spectrum["nodes"] > 0).any():
-                    nodes, weights = sign * spectrum["nodes"], spectrum["weights"]
+                    nodes, weights = sign * at_zero(spectrum["nodes"]), spectrum["weights"]
                     axes.step(*beyond(nodes, weights), where="pre", **look)
                     for one in range(len(nodes)):
                         axes.step(*beyond(nodes[one : one + 1], weights[one : one + 1]), where="pre", **look, **ALONE)
@@ -111,7 +112,12 @@ def draw_densities(records: Records) -> Figure:
         most = max(record.data.counts.active_parameters for record in records.values())
         panels[0].set_ylim(0.5 / most, 2)  # one direction is a share of 1 / parameters
         panels[0].set_ylabel("share of directions\nat least so curved")
-        _legend(figure, records, *[Line2D([], [], color=BLACK, label="end of the spectrum", **END)] * bool(ends))
+        handles = [Line2D([], [], color=BLACK, label="end of the spectrum", **END)] * bool(ends)
+        words = unresolved_share(
+            *(record.arrays["spectrum"] for record in records.values() if "spectrum" in record.arrays)
+        )
+        handles += [Line2D([], [], linestyle="none", label=words)] * bool(words)
+        _legend(figure, records, *handles)
     return figure
 
 
@@ -144,9 +150,10 @@ def draw_slices(records: Records) -> Figure:
             axes.set_axis_off()
         for axes, (label, field) in zip(panels.ravel(), planes.items(), strict=False):
             x, y, change = field.x.steps / 10.0**steps, field.y.steps / 10.0**steps, field.rise.T / 10.0**loss
+            change = np.ma.clip(change, levels[0], levels[-1])  # which it leaves outside the window only
             axes.set_facecolor(MISSING)
-            filled = axes.contourf(x, y, change, levels=levels, cmap=FIELD_MAP, extend="both")
-            axes.contour(x, y, change, levels=levels, colors=BLACK, linewidths=0.4)
+            filled = axes.contourf(x, y, change, levels=levels, cmap=FIELD_MAP)
+            axes.contour(x, y, change, levels=levels[1:-1], colors=BLACK, linewidths=0.4, linestyles="solid")
             i, j = np.nonzero(field.dots)
             axes.plot(x[i], y[j], **RENDERED)
             axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
@@ -154,7 +161,7 @@ def draw_slices(records: Records) -> Figure:
             axes.set(xlim=window, ylim=window, aspect="equal")
         figure.supxlabel(f"step along the steepest, units of the parameters{unit_suffix(steps)}", fontsize=7)
         figure.supylabel(f"step along the second{unit_suffix(steps)}", fontsize=7)
-        figure.colorbar(filled, ax=panels, label=f"change of loss{unit_suffix(loss)}", ticks=MaxNLocator(LEVELS // 2))  # pyright: ignore[reportPossiblyUnboundVariable]
+        figure.colorbar(filled, ax=panels, label=f"change of loss{unit_suffix(loss)}", ticks=levels[1:-1:2])  # pyright: ignore[reportPossiblyUnboundVariable]
     return figure
 
 

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from analysis.records.quantities import exponent_of, power_of_ten, quantity, unit_suffix
+from analysis.records.quantities import exponent_of, percent, power_of_ten, quantity, unit_suffix
 from figures.style import BLUE, VERMILION, new_figure, style
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray, ends: Mapping[st
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_ylim(10.0**-DECADES, 10.0 ** (ROOM[0 if ends else 2] + 1))
     axes.set_xlabel(f"curvature{unit_suffix(exponent)},\nloss per squared unit of the parameters")
-    axes.set_ylabel("density over\nits highest")
+    axes.set_ylabel("broadened density\nover its highest")
     axes.grid(True)
 
 
@@ -79,3 +79,23 @@ def smooth_density(
     apart = (curvature[:, None] - nodes.ravel()) / sigma
     shares = weights.ravel() / weights.sum()
     return curvature, np.exp(-0.5 * apart**2) @ shares / (sigma * np.sqrt(2 * np.pi)), sigma
+
+
+def at_zero(nodes: Float[np.ndarray, "starts k"]) -> Float[np.ndarray, "starts k"]:
+    """Nodes, with 0 in place of those that are not resolved from 0: nearer to it than range / k^2.
+
+    That is about how far apart the nodes of k steps of Lanczos are at an end of the spectrum, near which 0 lies: those of
+    Chebyshev begin 0.62 range / k^2 from the end.  Neither the sign nor the size of a nearer one is known.
+
+    >>> at_zero(np.array([[0.5, -2.0, 16.0]])).tolist()
+    [[0.0, -2.0, 16.0]]
+    """
+    return np.where(np.abs(nodes) < np.ptp(nodes) / nodes.shape[-1] ** 2, 0.0, nodes)
+
+
+def unresolved_share(*spectra: Mapping[str, np.ndarray]) -> str:
+    """Words on the share of directions at nodes that `at_zero` moves, over all starts; empty where it moves none."""
+    moved = [each["weights"] * (at_zero(each["nodes"]) != each["nodes"]) for each in spectra if "nodes" in each]
+    shares = [float(share) for each in moved for share in each.sum(axis=1)]
+    ends = " to ".join(dict.fromkeys(map(percent, (min(shares), max(shares))))) if shares else "0%"
+    return f"not resolved from 0: {ends} of all" if any(shares) else ""

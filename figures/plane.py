@@ -21,6 +21,7 @@ from analysis.records.records import Record
 from figures.style import literal
 from landscape.errors import InputError
 
+NOT_CONFIRMED = "not confirmed by renders"
 TRUE_PROPORTIONS = 2.5  # ranges whose ratio is below this are drawn to the same scale
 
 

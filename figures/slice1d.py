@@ -8,6 +8,7 @@ Grey: round-off hides the value; a triangle: it lies beyond the axis; hollow: an
 checkpoint, so that the difference holds kinks and jumps of the loss too.  The line is the infinitesimal curvature.
 """
 
+import textwrap
 from functools import partial
 from typing import Any
 
@@ -23,7 +24,7 @@ from analysis.records.records import Record
 from analysis.records.schema import FiniteProbe, Slice
 from figures.plane import Direction, direction
 from figures.scripts import script
-from figures.slice2d import CROSSED, RENDERED
+from figures.slice2d import CROSSED, RENDERED, finding, times
 from figures.style import BLACK, BLUE, VERMILION, new_figure, style
 from landscape.errors import InputError
 
@@ -62,8 +63,8 @@ def _draw_loss(axes: Axes, along: Direction, about: Slice, arrays: dict[str, np.
     axes.plot(along.scaled[known & ~crossed], change[known & ~crossed], **{**RENDERED, **DOT}, label="render")
     if crossed.any():
         axes.plot(along.scaled[crossed], change[crossed], **{**CROSSED, **DOT}, label="render, order changed")
-    if "model" in arrays:
-        model = (arrays["model"] - about.center_loss) / 10.0**exponent
+    model = (arrays["model"] - about.center_loss) / 10.0**exponent if "model" in arrays else None
+    if model is not None:
         low, high = axes.get_ylim()
         axes.plot(along.scaled, model, "--", color=VERMILION, linewidth=0.9, label="quadratic model")
         axes.set_ylim(low, high)
@@ -72,7 +73,7 @@ def _draw_loss(axes: Axes, along: Direction, about: Slice, arrays: dict[str, np.
     axes.xaxis.set_major_locator(MaxNLocator(7))
     axes.set_ylabel(f"change of loss{unit_suffix(exponent)}")
     axes.grid(True)
-    axes.set_title("Loss along a line through the checkpoint", loc="left")
+    axes.set_title(textwrap.fill(finding(along, change, model), 52), loc="left")
     if about.directions[0].kind == "line":
         axes.axvline(1, color="0.7", linewidth=0.5, zorder=0)
         axes.secondary_xaxis("top").set_xticks([0, 1], ["this checkpoint", "the other"])
@@ -106,7 +107,8 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: FiniteProbe) -> None:
     axes.set_xlabel(f"step along {along.name}, {along.scale}")
     axes.set_ylabel("curvature (loss per squared step)")
     axes.grid(True)
-    axes.set_title("Curvature at finite steps (bars: round-off)", loc="left")
+    seen = f"{times(values[sure] / exact)} the curvature" if sure.any() and exact else "hidden by round-off"
+    axes.set_title(f"At finite steps {seen}\n(bars: round-off)", loc="left")
 
 
 def _limits(exact: float, values: np.ndarray, bounds: np.ndarray) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 density        where one was recorded, as `figures.density` draws it
 distribution   of the same quadrature, without broadening: the share of directions whose curvature is at most x, and the share
                of sum |lambda| that these have, a line for each start vector; the further apart the two, the less isotropic the
-               loss
+               loss.  A node that is not resolved from 0 is drawn there
 Ritz values    of the search for both ends: value against rank, on a symmetric logarithmic axis (linear in the band about 0).
                Bars are residual norms: within each lies a true eigenvalue.  Filled: the residual is under a tenth of the value
 """
@@ -22,7 +22,8 @@ from matplotlib.transforms import ScaledTranslation
 from analysis.console.failures import program
 from analysis.records.quantities import measured, percent, power_of_ten
 from analysis.records.records import ProbeRecord, Record
-from figures.density import draw_on
+from analysis.records.schema import Eigenvalue
+from figures.density import at_zero, draw_on, unresolved_share
 from figures.scripts import script
 from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, style
 from landscape.errors import InputError
@@ -49,10 +50,13 @@ def draw(record: Record[ProbeRecord]) -> Figure:
             3 if known else 1, 1, squeeze=False, height_ratios=[1.4, 1, 1.6] if known else [1]
         )[:, 0]
         _draw_values(last, values, residuals)
-        _label_ends(last, record)
+        found = _ends(record)
+        lines = [f"{name}: {measured(end.value, end.residual)}" for name, end in found.items()]
+        last.set_title("\n".join([last.get_title(loc="left"), *lines]), loc="left", linespacing=1.4)
         if known:
-            found = {"λ min": record.data.eigenvalues.min.value, "λ max": record.data.eigenvalues.max.value}
-            ends = {name: end for name, end in found.items() if end is not None and math.isfinite(end)}
+            ends = {
+                name: end.value for name, end in found.items() if end.value is not None and math.isfinite(end.value)
+            }
             draw_on(above[0], arrays["nodes"], arrays["weights"], ends)
             above[0].set_title(_finding(arrays["nodes"], arrays["weights"]), loc="left")
             _draw_distribution(above[1], arrays["nodes"], arrays["weights"])
@@ -83,9 +87,9 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
     _symmetric_log(axes, "y", values)
     axes.set_xlim(0, len(values) + 1)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-    axes.set_xlabel("rank of the eigenvalue")
-    axes.set_ylabel("eigenvalue (loss per\nsquared unit of the parameters)")
-    axes.set_title(f"{len(values)} eigenvalues, met on the way to both ends", loc="left")
+    axes.set_xlabel("rank")
+    axes.set_ylabel("Ritz value (loss per\nsquared unit of the parameters)")
+    axes.set_title(f"{len(values)} Ritz values, {converged.sum()} converged", loc="left")
     axes.grid(True)
     looks = [(f"residual < {CONVERGED:.0%} of the value", "0.3", "0.3"), ("not converged", "0.3", "white")]
     looks += [("positive", POSITIVE, POSITIVE), ("negative", NEGATIVE, NEGATIVE)]
@@ -94,18 +98,18 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
     _legend_below(axes, handles)
 
 
-def _label_ends(axes: Axes, record: Record[ProbeRecord]) -> None:
-    ends = {"max": record.data.eigenvalues.max, "min": record.data.eigenvalues.min}
-    lines = [f"λ {name} {measured(end.value, end.residual)}" for name, end in ends.items()]
-    axes.set_title("\n".join([axes.get_title(loc="left"), *lines]), loc="left", linespacing=1.4)
+def _ends(record: Record[ProbeRecord]) -> dict[str, Eigenvalue]:
+    """Both ends by what they are, and whether renders doubt them."""
+    ends = {"λ max": record.data.eigenvalues.max, "λ min": record.data.eigenvalues.min}
+    return {f"{name}{', not confirmed' * end.doubted}": end for name, end in ends.items()}
 
 
 def _draw_distribution(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> None:
     _symmetric_log(axes, "x", nodes)
     left, right = axes.get_xlim()
-    for row, masses in zip(nodes, weights, strict=True):
+    for row, shown, masses in zip(nodes, at_zero(nodes), weights, strict=True):
         order = np.argsort(row)
-        x = np.concatenate([[left], row[order], [right]])
+        x = np.concatenate([[left], shown[order], [right]])
         for mass, look in ((masses, DIRECTIONS), (masses * np.abs(row), CURVATURE)):
             sums = np.concatenate([[0.0], np.cumsum(mass[order])])
             axes.step(x, np.append(sums, sums[-1]) / (sums[-1] or 1.0), where="post", **look)
@@ -113,7 +117,8 @@ def _draw_distribution(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> No
     axes.set_ylim(-0.03, 1.03)
     axes.set_xlabel("curvature x, loss per squared unit of the parameters")
     axes.set_ylabel("share ≤ x")
-    axes.set_title(f"Share below x; a staircase for each of {len(nodes)} starts", loc="left")
+    at_0 = unresolved_share({"nodes": nodes, "weights": weights})
+    axes.set_title(f"Share below x; a staircase for each of {len(nodes)} starts" + f"\n{at_0}" * bool(at_0), loc="left")
     axes.grid(True)
     lines = (("of all directions", DIRECTIONS), ("of all curvature, Σ|λ|", CURVATURE))
     _legend_below(axes, [Line2D([], [], label=label, **look) for label, look in lines])

@@ -12,8 +12,8 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
-from analysis.records.records import Record
-from figures.plane import plane, same_scale
+from analysis.records.records import ProbeRecord, Record
+from figures.plane import NOT_CONFIRMED, plane, same_scale
 from figures.scripts import script
 from figures.slice2d import RENDERED
 from figures.style import BLACK, FIELD_MAP, new_figure, style
@@ -40,12 +40,23 @@ def draw(record: Record) -> Figure:
         figure = new_figure(2.6)
         axes: Axes3D = figure.add_subplot(projection="3d", computed_zorder=False)  # pyright: ignore[reportAssignmentType]
         levels = MaxNLocator(LEVELS).tick_values(low, top)
-        axes.contour(x, y, height, levels=levels, zdir="z", offset=low, colors="0.7", linewidths=0.4, zorder=0)
+        axes.contour(
+            x,
+            y,
+            height,
+            levels=levels,
+            zdir="z",
+            offset=low,
+            colors="0.7",
+            linewidths=0.4,
+            linestyles="solid",
+            zorder=0,
+        )
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Z contains NaN")  # it has no surface there, as it should
             axes.plot_surface(x, y, height, rcount=len(x), ccount=len(y[0]), cmap=FIELD_MAP, vmin=low, vmax=top,
                               linewidth=0, antialiased=False)  # fmt: skip
-        axes.contour(x, y, height, levels=levels, colors=BLACK, linewidths=0.3)
+        axes.contour(x, y, height, levels=levels, colors=BLACK, linewidths=0.3, linestyles="solid")
         axes.plot(x[dots], y[dots], height[dots], **RENDERED)
         axes.set(xlim=field.x.scaled[[0, -1]], ylim=field.y.scaled[[0, -1]], zlim=(low, top))
         axes.set_xlabel(field.x.short_label, labelpad=-6)
@@ -61,8 +72,15 @@ def draw(record: Record) -> Figure:
         curvatures = ", ".join(f"{d.name} {quantity(d.curvature)}" for d in (field.x, field.y))
         flat = "" if high > low else "\nthe loss is the same at every point"
         scales = "" if alike else "\nthe steps differ in scale"
-        figure.suptitle(f"Curvature along {curvatures}{flat}{scales}", fontsize=7)
+        title = f"Curvature along {curvatures}{_doubt(record)}{flat}\nsteps: {field.x.scale}{scales}"
+        figure.suptitle(title, fontsize=7)
     return figure
+
+
+def _doubt(record: Record) -> str:
+    """A line where the record is of a probe whose renders do not confirm the largest curvature."""
+    doubted = isinstance(record.data, ProbeRecord) and record.data.eigenvalues.max.doubted
+    return f"\nlargest curvature {NOT_CONFIRMED}" * doubted
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """Figure: the landscape along one or several trainings, from the table that `landscape trajectory` wrote.
 
 `python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Every panel has a logarithmic axis of magnitudes,
-hollow where the number is negative.  Bands show 95% intervals of the traces, residuals of the eigenvalues, and brackets of the
-participation ratio.  The title says what became of the steepest curvature.
+hollow where the number is negative; a number is left off that is 0 within round-off of the panel's largest.  A method has one
+colour, its trainings differ by their lines.  The title says what became of the steepest curvature of each method.
 """
 
+import textwrap
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,9 +32,14 @@ PANELS = {
     "participation_ratio": "participation ratio",
     "gaussians": "Gaussians",
 }
-UNITS = "traces, eigenvalues: loss per squared unit of the parameters"
+UNITS = (
+    "traces, eigenvalues: loss per squared unit of the parameters\n"
+    "bands: 95% (traces), residuals (eigenvalues), else brackets"
+)
+NEGATIVE, LINES = "−λ min", ("-", "--", ":", "-.")  # title where all are negative; of the trainings of a method
+ROUND_OFF = float(np.finfo(np.float32).eps)
 PANEL = 1.12  # inches of height
-LEGEND_LINE = 0.14
+LEGEND_LINE, WRAP = 0.14, 58
 ARROW: dict[str, Any] = {"marker": r"$\uparrow$", "markersize": 7, "linestyle": "none"}  # stands on a lower bound
 
 
@@ -45,11 +51,18 @@ def draw(table: pd.DataFrame) -> Figure:
     measured = with_ends(pd.DataFrame(table[table["state"] != "skipped"]))
     if measured["lambda_max"].dropna().empty:
         raise InputError("expected at least one record that was not skipped, got none")
-    runs = {str(name): RUNS[i % len(RUNS)] for i, name in enumerate(table["run"].unique())}
+    methods: dict[str, list[str]] = {}
+    for name in map(str, table["run"].unique()):
+        methods.setdefault(name.rpartition("/")[0] or name, []).append(name)
+    runs = {
+        name: {"color": RUNS[i % len(RUNS)], "linestyle": LINES[k % len(LINES)]}
+        for i, names in enumerate(methods.values())
+        for k, name in enumerate(names)
+    }
     with style():
-        figure = new_figure(PANEL * 3 + LEGEND_LINE * (2 * len(runs) + 4))
+        figure = new_figure(PANEL * 3 + LEGEND_LINE * (len(methods) + len(runs) + 6))
         for axes, (name, title) in zip(figure.subplots(3, 2).flat, PANELS.items(), strict=True):
-            axes.set_title(literal(title))
+            axes.set_title(NEGATIVE if name == "lambda_min" and (measured[name].dropna() < 0).all() else literal(title))
             over_steps(axes, measured, runs, name)
             axes.grid(True)
             axes.xaxis.set_major_locator(step_ticks())
@@ -58,8 +71,10 @@ def draw(table: pd.DataFrame) -> Figure:
                 axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center")
         for axes in figure.axes[-2:]:
             axes.set_xlabel("step")
-        figure.suptitle("\n".join(_happened(name, measured) for name in runs), fontsize=7.5, x=0.02, ha="left")
-        handles = [Line2D([], [], color=colour, label=literal(name)) for name, colour in runs.items()]
+        figure.suptitle(
+            "\n".join(_happened(*each, measured) for each in methods.items()), fontsize=7.5, x=0.02, ha="left"
+        )
+        handles = [Line2D([], [], label=literal(name), **look) for name, look in runs.items()]
         handles += marker_words(measured, *PANELS)
         handles.append(Line2D([], [], linestyle="none", label=UNITS))
         figure.legend(handles=handles, loc="outside lower center", ncols=1)
@@ -74,14 +89,16 @@ def with_ends(measured: pd.DataFrame) -> pd.DataFrame:
     return measured.assign(**low, **high)
 
 
-def _happened(run: str, measured: pd.DataFrame) -> str:
-    """What became of a run's steepest curvature, in words."""
-    known = measured[(measured["run"] == run) & (measured["lambda_max"] > 0)]
-    if len(known) < 2:
-        return literal(f"{run}: one record of λ max")
-    first, last = known.iloc[0], known.iloc[-1]
-    times = rough(float(last["lambda_max"] / first["lambda_max"]))
-    return literal(f"{run}: λ max × {times} from step {first['step']:,} to {last['step']:,}")
+def _happened(method: str, runs: list[str], measured: pd.DataFrame) -> str:
+    """What became of the steepest curvature in the trainings of a method, in words."""
+    known = [measured[(measured["run"] == run) & (measured["lambda_max"] > 0)] for run in runs]
+    if min(map(len, known)) < 2:
+        return literal(f"{method}: one record of λ max")
+    grown = sorted(float(each["lambda_max"].iloc[-1] / each["lambda_max"].iloc[0]) for each in known)
+    some = "one run" if len(runs) == 1 else f"{len(runs)} runs"
+    words = " to ".join(dict.fromkeys((rough(grown[0]), rough(grown[-1]))))
+    first, last = known[0]["step"].iloc[0], known[0]["step"].iloc[-1]
+    return textwrap.fill(literal(f"{method}: λ max × {words} from step {first:,} to {last:,} ({some})"), WRAP)
 
 
 def step_ticks() -> MaxNLocator:
@@ -89,28 +106,31 @@ def step_ticks() -> MaxNLocator:
     return MaxNLocator(4, integer=True, steps=[1, 2, 2.5, 5, 10])
 
 
-def over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], name: str) -> None:
-    """A number of every run over the steps, its magnitude on a logarithmic axis, with its interval.  runs: name -> colour.
+def over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, dict[str, str]], name: str) -> None:
+    """A number of every run over the steps, its magnitude on a logarithmic axis, with its interval.  runs: name -> look.
 
     Hollow where it is negative.  Of one with only a lower bound an arrow stands on that, without a line; without one, nothing.
     """
     axes.set_yscale("log")
     axes.margins(0.08, 0.12)
-    for run, colour in runs.items():
+    least = ROUND_OFF * measured[name].abs().max()
+    for run, look_of in runs.items():
+        colour = look_of["color"]
         part = pd.DataFrame(measured[(measured["run"] == run) & measured[name].notna()])
         steps, values = part["step"].to_numpy(float), part[name].to_numpy(float)
         ends = np.stack([part[f"{name}_{end}"].to_numpy(float) for end in ("low", "high")])
         bounded, (low, high) = np.isfinite(ends).all(axis=0), np.abs(ends)
-        shown = np.where(bounded & (values != 0), np.abs(values), np.nan)  # 0 has no place on a logarithmic axis
+        shown = np.where(bounded & (np.abs(values) > least), np.abs(values), np.nan)  # 0 has no place on the axis
         inner = np.where(ends[0] * ends[1] < 0, 0.0, np.fmin(np.fmin(low, high), shown))
         outer = np.fmax(np.fmax(low, high), shown)
+        outer[outer <= least] = np.nan
         axes.fill_between(steps, inner, outer, color=colour, alpha=0.25, linewidth=0)
-        axes.plot(steps, shown, color=colour, linewidth=1.1)
+        axes.plot(steps, shown, linewidth=1.1, **look_of)
         for sign, face in ((values >= 0, colour), (values < 0, "white")):
             look: dict[str, Any] = {"markerfacecolor": face, "markersize": 3, "linestyle": "none"}
             axes.plot(steps[sign], shown[sign], "o", color=colour, **look)
-        least = np.fmin(low, high)[~bounded]
-        axes.plot(steps[~bounded], np.where(least > 0, least, np.nan), color=colour, **ARROW)
+        bound = np.fmin(low, high)[~bounded]
+        axes.plot(steps[~bounded], np.where(bound > 0, bound, np.nan), color=colour, **ARROW)
     few_decades(axes.yaxis)
 
 

@@ -29,7 +29,7 @@ from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
 from analysis.measures.localization import mass_shares, masses, participation
-from analysis.records.quantities import Shade, percent, quantity, ratio, rough
+from analysis.records.quantities import AGREES, Shade, percent, quantity, ratio, rough
 from analysis.records.run_files import Carrier, Steepest
 from analysis.records.schema import Carries
 from landscape import curvature_reach
@@ -47,7 +47,6 @@ NEAR = 0.01  # |residual|, of a range of 1, below which residuals are taken to b
 LEAST, MOST = 0.05, 5  # smallest share of the mass of a carrier; most carriers
 RISE = 0.01  # relative change of the loss at the longest step, by the curvature
 STEPS = 7  # each half of the one before; the shortest changes the loss by 2e-6, above round-off
-AGREES = 0.2  # largest |factor - 1| that counts as agreement
 SIGMAS = 2.0  # standard deviations at which an outline is drawn
 ROOM, SMALLEST = 1.3, 8  # size of a crop: in outlines; at least 1 / SMALLEST of its view
 VERBS = {"means": "moves", "log_scales": "stretches", "quats": "turns", "opacity_logits": "fades", "sh": "recolours"}

@@ -18,6 +18,7 @@ UNDETERMINED = "–"
 HARD = "\N{NO-BREAK SPACE}"
 PLUS_MINUS, TIMES = f"{HARD}±{HARD}", f"{HARD}×{HARD}"
 DIGITS = 3  # significant
+AGREES = 0.2  # largest |ratio - 1| of two numbers that are said to agree
 BYTES, NOTHING = 254, 255  # of a scale in bytes: its upper end, and the code of no value
 GREY = 128  # the colour of no value, in bytes
 SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}  # of metrics.json

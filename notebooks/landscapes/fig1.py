@@ -1,9 +1,10 @@
 """Figure after the paper's Fig. 1: two landscapes side by side, and what the two scenes look like from a view held out.
 
 `python -m notebooks.landscapes.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint
-along the two steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1, e_2), under the
-largest eigenvalue and over that of the first run; below, the photograph of the first view that both have rendered, and
-both renders with their PSNR.  Both share their axes (`manifold`).
+along the two steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1, e_2), under its step,
+the largest eigenvalue, how many times that of the first run it is, and whether renders confirm it (by the probe, if there is
+one); below, the photograph of the first view that both have rendered, and both renders with their PSNR.  Both share their axes
+(`manifold`).
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 
 from analysis.console.failures import program
 from analysis.records.quantities import rough
@@ -26,7 +26,9 @@ from notebooks.landscapes.fig7 import names_of, read_all
 from notebooks.landscapes.manifold import (
     Scale,
     contours,
+    doubt_of,
     landscape_of,
+    record_of,
     require_same_function,
     runs_script,
     section,
@@ -50,6 +52,7 @@ def draw(runs: Sequence[Path]) -> Figure:
         )
     view = min(common)
     scale = Scale.of(*landscapes)
+    sections = scale.of_sections(*landscapes)
     with style():
         figure = new_figure(7.4, WIDTH)
         above, below = figure.subfigures(2, 1, height_ratios=[3.6, 1], squeeze=False)[:, 0]
@@ -60,36 +63,36 @@ def draw(runs: Sequence[Path]) -> Figure:
             axes.axis("off")
         if photograph is not None:
             pictures[0].imshow(photograph)
-            pictures[0].set_title(f"photograph of\n{literal(view)}")
+            pictures[0].set_title(f"held-out view\n{literal(view)}")
         for i, (run, name, landscape) in enumerate(zip(runs, names, landscapes, strict=True)):
-            surface(above, (3, 2, 1 + i), landscape, scale, f"{name}: {_steepness(landscape, landscapes[0])}")
+            surface(above, (3, 2, 1 + i), landscape, scale, _heading(i, runs, names, landscapes))
             filled = contours(maps[i], landscape, scale)
             across = above.add_subplot(3, 2, 5 + i)
             for axis, colour in enumerate(ALONG.values()):
-                section(across, landscape, scale, axis, color=colour)
-            across.set(
-                xlabel=scale.flat_label("e₁, e₂"), ylim=[end / 10.0**scale.loss for end in (scale.low, scale.high)]
-            )
+                section(across, landscape, sections, axis, color=colour)
+            across.set_xlabel(scale.flat_label("e₁, e₂"))
             picture = pictures[i - len(runs)]
             picture.imshow(imread(run / RENDERS / view))
             picture.set_title(f"{literal(name)}\n{_score(run, view)}")
             if i == 0:
-                across.set_ylabel(scale.loss_label)
+                across.set_ylabel(sections.loss_label)
             else:
-                above.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=MaxNLocator(5))
+                above.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=filled.levels[1::2])
         handles = [Line2D([], [], color=colour, label=f"along {name}") for name, colour in ALONG.items()]
+        handles.append(Line2D([], [], linestyle="none", label="one training each"))
         figure.set_label(_caption(names, landscapes))
-        above.legend(handles=handles, loc="outside lower center", ncols=2)
+        above.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
 
 
-def _steepness(landscape: Plane, first: Plane) -> str:
-    """The largest eigenvalue, and over that of the first run."""
-    value, reference = landscape.x.curvature, first.x.curvature
-    words = f"λ = {rough(value)}"
-    if landscape is first or not (value and reference and np.isfinite([value, reference]).all()):
-        return words
-    return f"{words} (× {rough(value / reference)})"
+def _heading(i: int, runs: Sequence[Path], names: Sequence[str], landscapes: Sequence[Plane]) -> str:
+    """The run's step and largest eigenvalue, how many times that of the first run it is, and whether renders doubt it."""
+    value, reference = landscapes[i].x.curvature, landscapes[0].x.curvature
+    step, doubt = record_of(runs[i]).data.provenance.iteration, doubt_of(runs[i])
+    words = names[i] + (f", step {step:,}" if step else "") + f": λ max {rough(value)}"
+    if i and value and reference and np.isfinite([value, reference]).all():
+        words += f"\n{rough(value / reference)} times that of {names[0]}"
+    return words + f"\n{doubt}" * bool(doubt)
 
 
 def _caption(names: Sequence[str], landscapes: Sequence[Plane]) -> str:

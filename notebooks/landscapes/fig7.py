@@ -1,10 +1,10 @@
 """Figure after the paper's Fig. 7: the anisotropy index over two trainings, where they ended, and where they began.
 
 `python -m notebooks.landscapes.fig7 RUN_3DGS RUN_STABLEGS --out fig7.png`.  Above: |lambda_max / lambda_min| (Eq. (3); open:
-negative) with its bracket, and the loss around both checkpoints along the two steepest eigenvectors.  Below: the same around
-the start of the first run, and sections through all three along e_1 and e_2.  All axes are those of the two ends (`manifold`),
-but for the start's surface, whose title says how much farther it reaches (a start may be hundreds of times wider than an end),
-and the sections' losses, which hold the start's too: a slope is not cut off where it falls below its centre.
+negative) with its bracket, of records of a training, which confirm no end by renders, and the loss around both checkpoints
+along the two steepest eigenvectors.  Below: the same around the start of the first run, and sections through all three along
+e_1 and e_2.  All axes are those of the two ends (`manifold`), but for the start's surface, whose title says how much farther it
+reaches (a start may be hundreds of times wider than an end), and the sections' losses, which hold the sections alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,6 +14,7 @@ from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from analysis.console.failures import program
 from analysis.records.quantities import rough
@@ -32,7 +33,7 @@ from notebooks.landscapes.manifold import (
 )
 
 PAGE = 6.9  # inches
-BEGINNING = "start"
+BEGINNING, UNIT = "start", "e₁, e₂: units of the parameters"
 BAR: dict[str, Any] = {"shrink": 0.6, "aspect": 14}  # without a name: the title above has it
 
 
@@ -47,17 +48,23 @@ def draw(runs: Sequence[Path]) -> Figure:
     measured, ends = pd.concat(found[:2], ignore_index=True), found[2:]
     require_same_function(runs)
     scale, wide = Scale.of(*ends), Scale.of(start)
-    across = scale.holding(start)
+    across = scale.of_sections(*ends, start)
     with style():
         figure = new_figure(4.4, PAGE)
         index = figure.add_subplot(2, 3, 1)
-        over_steps(index, measured, dict(zip(names, RUNS, strict=False)), "eigenvalue_ratio")
-        index.set(xlabel="step", ylabel="|λmax / λmin|", title="Anisotropy index")
+        over_steps(
+            index,
+            measured,
+            {name: {"color": each} for name, each in zip(names, RUNS, strict=False)},
+            "eigenvalue_ratio",
+        )
+        title = "Anisotropy index, one training each\n(no renders confirm its ends)"
+        index.set(xlabel="step", ylabel="|λ max / λ min|", title=title)
         index.xaxis.set_major_locator(step_ticks())
         index.grid(True)
         drawn = [surface(figure, (2, 3, 2 + i), end, scale, f"{names[i]}, end") for i, end in enumerate(ends)]
         figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], **BAR)
-        title = f"{BEGINNING}, steps × {rough(wide.reach / scale.reach)}"
+        title = f"{BEGINNING} of {names[0]},\n{rough(wide.reach / scale.reach)} times the steps of the ends"
         around, colours = surface(figure, (2, 3, 4), start, wide, title)
         figure.colorbar(colours, ax=around, **BAR)
         for axis, direction in enumerate(("e₁", "e₂")):
@@ -70,7 +77,13 @@ def draw(runs: Sequence[Path]) -> Figure:
         for line, name in zip(handles, (*names, BEGINNING), strict=True):
             line.set_label(literal(name))
         figure.legend(
-            handles=[*handles, *marker_words(measured, "eigenvalue_ratio")], loc="outside lower center", ncols=4
+            handles=[
+                *handles,
+                *marker_words(measured, "eigenvalue_ratio"),
+                Line2D([], [], linestyle="none", label=UNIT),
+            ],
+            loc="outside lower center",
+            ncols=5,
         )
     return figure
 

@@ -22,12 +22,13 @@ from mpl_toolkits.mplot3d import Axes3D
 from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import ProbeRecord, Record, SliceRecord, read_record
 from analysis.records.run_files import CHECKPOINT
-from figures.plane import Plane, plane
+from figures.plane import NOT_CONFIRMED, Plane, plane
 from figures.scripts import add_paper, print_files
 from figures.style import BLACK, FIELD_MAP, MISSING, literal, save
 from landscape.errors import InputError
 
 START = "start"
+ROOM = 0.05  # of the range of sections, beyond it
 INNER = 0.65  # of the reach of a surface: no tick farther out
 ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
 SLICES = (
@@ -73,15 +74,18 @@ class Scale:
         """Label of a horizontal axis, which has the room for the unit below."""
         return f"{self.step_label(name)}\n(units of the parameters)"
 
-    def holding(self, other: Plane) -> "Scale":
-        """Limits with the same steps that hold another landscape's sections too."""
+    def of_sections(self, *landscapes: Plane) -> "Scale":
+        """Limits with the same steps that hold the landscapes' sections, with some room."""
         near = np.ma.concatenate(
             [
-                other.through_centre(other.rise, axis)[np.abs(along.steps) <= self.reach]
-                for axis, along in enumerate((other.x, other.y))
+                each.through_centre(each.rise, axis)[np.abs(along.steps) <= self.reach]
+                for each in landscapes
+                for axis, along in enumerate((each.x, each.y))
             ]
         )
-        return replace(self, low=min(self.low, float(near.min())), high=max(self.high, float(near.max())))
+        low, high = float(near.min()), float(near.max())
+        room = ROOM * (high - low) or 1.0
+        return replace(self, low=low - room, high=high + room)
 
 
 def window(landscape: Plane, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +100,7 @@ def window(landscape: Plane, reach: float) -> tuple[np.ndarray, np.ndarray]:
 
 def require_same_function(runs: Sequence[Path]) -> None:
     """InputError where the runs' landscapes are those of different functions; what a record lacks is not compared."""
-    records = {run: _record_of(run).data for run in runs}
+    records = {run: record_of(run).data for run in runs}
     for key, what in FUNCTION.items():
         found = {
             run: getattr(data.provenance if key == "views" else data.objective, key) for run, data in records.items()
@@ -116,10 +120,10 @@ def landscape_of(run: Path) -> Plane:
 
     FileNotFoundError or ValueError name the record that is missing and the command that makes it.
     """
-    return plane(_record_of(run))
+    return plane(record_of(run))
 
 
-def _record_of(run: Path) -> Record:
+def record_of(run: Path) -> Record:
     for name, kind in SLICES:
         if (run / name / kind.FILE).is_file():
             found = read_record(run / name, kind)
@@ -136,6 +140,13 @@ def _record_of(run: Path) -> Record:
         f"expected a slice of {run} in {' or '.join(str(run / name) for name, _ in SLICES)}, with a surface, "
         f"found none; {_slice(run)}"
     )
+
+
+def doubt_of(run: Path) -> str:
+    """Words where renders of the run's probe do not confirm its λ max; none without such."""
+    if not (run / "probe" / ProbeRecord.FILE).is_file():
+        return ""
+    return NOT_CONFIRMED * read_record(run / "probe", ProbeRecord).data.eigenvalues.max.doubted
 
 
 def start_of(run: Path) -> Plane:
@@ -197,7 +208,7 @@ def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
     x, y, change = landscape.x.steps / steps, landscape.y.steps / steps, landscape.rise.T / loss
     axes.set_facecolor(MISSING)
     filled = axes.contourf(x, y, change, levels=levels, cmap=FIELD_MAP)
-    axes.contour(x, y, change, levels=levels, colors=BLACK, linewidths=0.4)
+    axes.contour(x, y, change, levels=levels, colors=BLACK, linewidths=0.4, linestyles="solid")
     reach = scale.reach / steps
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     for axis in (axes.xaxis, axes.yaxis):  # as many at any size: the layout counts their room at its first size

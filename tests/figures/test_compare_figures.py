@@ -8,6 +8,7 @@ import pytest
 
 from analysis.records.records import ProbeRecord, Record
 from figures.compare import ALONE, beyond, draw_comparison, draw_densities, draw_sections, draw_slices, draw_traces
+from figures.density import at_zero, unresolved_share
 from figures.style import RUNS, style
 from tests.figures.test_figures import POINT, laid_out
 from tests.recorded import probe_of, synthetic
@@ -64,7 +65,7 @@ def test_a_density_shows_how_far_its_start_vectors_lie_apart(tmp_path):
     spectrum = record.arrays["spectrum"]
     thin = [line for line in draw_densities({"one": record}).axes[1].lines if line.get_alpha() == ALONE["alpha"]]
     assert len(thin) == len(spectrum["nodes"]) == 3
-    for line, nodes, weights in zip(thin, spectrum["nodes"], spectrum["weights"], strict=True):
+    for line, nodes, weights in zip(thin, at_zero(spectrum["nodes"]), spectrum["weights"], strict=True):
         assert float(np.asarray(line.get_ydata())[0]) == pytest.approx(weights[nodes > 0].sum())
 
 
@@ -74,11 +75,33 @@ def test_a_side_of_which_only_ends_are_known_says_so(tmp_path):
     figure = draw_densities({"one": record})
     said = [[text.get_text() for text in axes.texts] for axes in figure.axes]
     assert said == [["the density found none;\nthe ends alone are known"], []]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "end of the spectrum"]
+    unresolved = unresolved_share(record.arrays["spectrum"])
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert said == ["one", "end of the spectrum", unresolved] and unresolved.startswith("not resolved from 0: ")
     record.data.eigenvalues.max.value = record.data.eigenvalues.min.value = None
     figure = draw_densities({"one": record})
     assert [text.get_text() for text in figure.axes[0].texts] == ["none found"]
-    assert len(figure.legends[0].get_texts()) == 1
+    assert len(figure.legends[0].get_texts()) == 2
+
+
+def test_a_node_of_either_sign_that_is_not_resolved_from_0_curves_neither_up_nor_down(tmp_path):
+    """One node holds nearly all of the weight, and its sign differs from start to start."""
+    (record,) = records(tmp_path, 1.0).values()
+    nodes = np.array([[-1.0, 1e-5, 0.5, 3.0], [-1.0, -1e-5, 0.6, 3.0]])
+    record.arrays["spectrum"] |= {"nodes": nodes, "weights": np.full((2, 4), [0.01, 0.95, 0.03, 0.01])}
+    down, up = draw_densities({"one": record}).axes
+    most = [max(float(np.max(line.get_ydata())) for line in axes.lines if len(line.get_ydata()) > 2 or line.get_alpha())
+            for axes in (down, up)]  # fmt: skip
+    assert most == pytest.approx([0.01, 0.04])
+
+
+def test_the_colour_bar_of_slices_is_labelled_at_its_levels_and_ends_at_the_data(tmp_path):
+    figure = draw_slices(records(tmp_path, 1.0, 0.25))
+    (bar,) = [axes for axes in figure.axes if axes.get_label() == "<colorbar>"]
+    levels = figure.axes[0].collections[0].levels  # pyright: ignore[reportAttributeAccessIssue]
+    labels = [float(text.get_text().replace("−", "-")) for text in bar.get_yticklabels()]
+    assert labels == pytest.approx(levels[1:-1:2]) and bar.get_ylim() == pytest.approx((levels[0], levels[-1]))
+    assert [axes.collections[0].extend for axes in figure.axes[:2]] == ["neither"] * 2  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_the_numbers_along_the_steps_of_sections_stay_apart(tmp_path):

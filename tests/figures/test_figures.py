@@ -16,10 +16,11 @@ from PIL import Image
 
 from analysis.console.drawing import own_python
 from analysis.records.quantities import exponent_of
+from analysis.records.records import read_record
 from analysis.records.run_files import END_MAPS, Steepest
 from figures import make_all, maps, slice2d, spectrum, surface, traces
 from figures.plane import plane
-from figures.style import BLACK, COLUMN, save, style
+from figures.style import BLACK, COLUMN, SKY, save, style
 from landscape.errors import TooLittleMemory
 from tests.recorded import long_numbers, synthetic, written, written_map
 from tests.refusals import refused
@@ -99,6 +100,9 @@ def difficult(case):
         data["slice"] |= {"loss_scale": 7.49e-5, "interpolation_error": 0.005}
         arrays["slice"]["evaluated"] = (np.arange(21 * 17) % 5 == 0).reshape(21, 17)
         arrays["slice"]["crossed"] = arrays["slice"]["evaluated"]
+        steps = np.linspace(-1, 1, 21)[:, None] * np.ones(17)
+        arrays["slice"]["model"] = data["slice"]["center_loss"] + 2e-3 * steps**2
+        arrays["slice"]["loss"] = data["slice"]["center_loss"] + 2e-3 * (1.1 - abs(steps)) * steps**2
     if case == "least":
         arrays = {"slice": {k: arrays["slice"][k] for k in ("x", "y", "loss")}, "spectrum": arrays["spectrum"]}
         arrays["spectrum"] = {k: arrays["spectrum"][k][[0, -1]] for k in ("ritz_values", "residuals")}
@@ -151,10 +155,24 @@ def test_a_density_shows_who_has_the_curvature(tmp_path):
     axes = spectrum.draw(written(tmp_path / "probe", data, arrays)).axes[1]
     directions, curvature = (np.asarray(line.get_ydata(), float) for line in axes.lines[:2])
     x = np.asarray(axes.lines[0].get_xdata(), float)
-    np.testing.assert_array_equal(x[1:-1], [-20.0, 0.1, 61.0])
+    np.testing.assert_array_equal(x[1:-1], [-20.0, 0.0, 61.0])  # 0.1 is not resolved from 0
     np.testing.assert_allclose(directions[1:-1], [0.05, 0.95, 1.0], rtol=1e-12)
     np.testing.assert_allclose(curvature[1:-1], np.array([1.0, 1.09, 4.14]) / 4.14, rtol=1e-12)
     assert directions[0] == 0 == curvature[0] and directions[-1] == 1 == curvature[-1]
+    assert axes.get_title(loc="left").endswith("not resolved from 0: 90% of all")
+
+
+def test_ritz_values_and_ends_are_headed_by_what_is_converged_and_confirmed(tmp_path):
+    data, arrays = synthetic()
+    renders = {"confirmed": False, "steps": [1e-3], "ratios": [-2.0], "errors": [0.1]}
+    data["eigenvalues"]["min"]["renders"] = renders
+    axes = spectrum.draw(written(tmp_path / "probe", data, arrays)).axes
+    first, top, bottom = axes[-1].get_title(loc="left").split("\n")
+    found = arrays["spectrum"]
+    converged = (found["residuals"] < spectrum.CONVERGED * abs(found["ritz_values"])).sum()
+    assert first == f"60 Ritz values, {converged} converged" and 0 < converged < 60
+    assert top.startswith("λ max: ") and bottom.startswith("λ min, not confirmed: ")
+    assert any(text.get_text().startswith("λ min, not confirmed = ") for text in axes[0].texts)
 
 
 def test_cross_sections_are_the_rows_and_columns_through_the_centre(tmp_path):
@@ -211,30 +229,80 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     }
     assert dots == {slice2d.FAINT["color"]: 5 * 5}
     said = " ".join(text for text, _ in words(figure, laid_out(figure)))
-    assert "plane: 7% rendered,\nelse interpolated (error <0.40%)" in said and "order changed:\n10 of 25" in said
-    sections = [axes for axes in figure.axes if "step along" in axes.get_xlabel()]
-    along = [[len(np.asarray(x.get_xdata())) for x in axes.lines if x.get_marker() == "."] for axes in sections]
-    assert [3, 2] in along  # the crossed ones apart
+    assert (
+        "plane: 7% rendered,\nelse interpolated (error <0.40%)" in said and "order changed: 10\nof 25 renders" in said
+    )
+    assert _blue(figure) == [2, 0]
+
+
+def _blue(figure):
+    """Numbers of blue dots in the two sections."""
+    sections = [axes for axes in figure.axes if axes.get_title(loc="left").startswith("Along")]
+    return [sum(len(np.asarray(x.get_xdata())) for x in axes.lines if x.get_color() == SKY) for axes in sections]
+
+
+@pytest.mark.parametrize(("changed", "dots"), [(0.9, [18, 1]), (0.96, [0, 0])])
+def test_where_the_order_changed_at_nearly_all_renders_the_legend_says_so_without_dots(tmp_path, changed, dots):
+    data, arrays = synthetic()
+    arrays["slice"]["crossed"] = np.zeros((21, 17), bool)
+    arrays["slice"]["crossed"][: round(changed * 20), 8] = True
+    arrays["slice"]["evaluated"] = np.zeros((21, 17), bool)
+    arrays["slice"]["evaluated"][:20, 8] = True
+    figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
+    assert _blue(figure) == dots
+    entries = {
+        x.get_label().replace("\n", " "): x.get_marker()
+        for x in slice2d._legend(plane(read_record(tmp_path / "probe")))
+    }
+    assert entries[f"order changed: {round(changed * 20)} of 20 renders"] == ("." if any(dots) else "None")
+
+
+def test_contours_of_the_loss_are_solid_also_below_0_and_at_the_ticks_of_the_colour_bar(tmp_path):
+    data, arrays = synthetic()
+    arrays["slice"]["loss"] = 2 * data["slice"]["center_loss"] - arrays["slice"]["loss"]
+    figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
+    axes = next(each for each in figure.axes if each.get_ylabel().startswith("step"))
+    _, loss, model = axes.collections
+    assert (loss.levels < 0).any() and [dashes for _, dashes in loss.get_linestyle()] == [None] * len(loss.levels)
+    assert model.get_linestyle()[0][1] is not None
+    (bar,) = axes.child_axes
+    assert list(bar.get_yticks()) == list(loss.levels)
+
+
+@pytest.mark.parametrize(("stretch", "same"), [(1.2, True), (1.6, False)])
+def test_ranges_that_are_alike_have_the_same_ticks(tmp_path, stretch, same):
+    data, arrays = synthetic()
+    arrays["slice"]["x"] = np.linspace(-6.5, 6.5, 21)
+    arrays["slice"]["y"] = np.linspace(-6.5, 6.5, 17) * stretch
+    figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
+    first, second = (
+        each.get_xticks().tolist() for each in figure.axes if each.get_title(loc="left").startswith("Along")
+    )
+    assert (first == second) == same
 
 
 @pytest.mark.parametrize(
     ("ratio", "said"),
     [
-        (1.1, "changes as its curvature says"),
-        (0.14, "rises, 0.14 times what its curvature says"),
-        (-2.0, "falls, against its curvature"),
+        (lambda s: 1.1, "curves as its curvature says"),
+        (lambda s: 0.14, "curves up 0.14 times what its curvature says"),
+        (lambda s: 2.15 - 1.03 * s, "curves up 1.1 to 2.0 times what its curvature says"),
+        (lambda s: 1.1 - s, "curves as its curvature says to 0.90 units, then 0.10 to 0.70 times as much"),
+        (lambda s: 10 * (s - 0.5) ** 2 - 0.2, "curves −0.20 to 2.3 times what its curvature says"),
+        (lambda s: 1.3 - 1.5 * s, "curves as its curvature says to 0.90 units, then falls on one side"),
+        (lambda s: -0.2, "falls on one side, against its curvature"),
+        (lambda s: -2.0, "falls on both sides, against its curvature"),
     ],
 )
 def test_a_section_is_headed_by_how_far_its_curvature_holds(tmp_path, ratio, said):
-    """With a slope, which cancels in the mean of both ends."""
+    """With a slope, which cancels in second differences.  Steps of 0.3 units to 3."""
     data, arrays = synthetic()
     steps = np.linspace(-1, 1, 21)[:, None] * np.ones(17)
     arrays["slice"]["model"] = data["slice"]["center_loss"] + steps + 2 * steps**2
-    arrays["slice"]["loss"] = data["slice"]["center_loss"] + steps + 2 * ratio * steps**2
+    arrays["slice"]["loss"] = data["slice"]["center_loss"] + steps + 2 * ratio(abs(steps)) * steps**2
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     titles = [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes]
     assert f"Along {data['slice']['directions'][0]['name']} the loss {said}" in titles
-    require_layout(figure)
 
 
 def test_a_plane_of_too_few_renders_is_drawn_as_its_sections_with_the_command_that_resolves_it(tmp_path):

@@ -37,6 +37,17 @@ def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, c
     require_layout(figure)
 
 
+def test_the_titles_name_the_direction_and_say_how_the_loss_curves_beside_the_curvature(tmp_path):
+    data, arrays = synthetic_line()
+    center = data["slice"]["center_loss"]
+    arrays["slice"]["loss"] = center + 3 * (arrays["slice"]["model"] - center)
+    above, below = (axes.get_title(loc="left") for axes in slice1d.draw(written(tmp_path / "slice", data, arrays)).axes)
+    assert (
+        above == f"Along {data['slice']['directions'][0]['name']} the loss curves up 3.0 times what its\ncurvature says"
+    )
+    assert below == "At finite steps 1.0 to 1.8 times the curvature\n(bars: round-off)"
+
+
 def test_dots_are_renders_and_the_blue_ones_are_crossed(tmp_path):
     record = written(tmp_path / "slice", *synthetic_line())
     above, arrays = slice1d.draw(record).axes[0], record.arrays["slice"]

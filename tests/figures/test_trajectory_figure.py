@@ -62,13 +62,32 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
         lines = [x for x in panels["trace of position"].lines if to_hex(x.get_color()).upper() == colour]
         assert list(np.asarray(lines[0].get_xdata())) == [1000, 1500, 2000], name  # the skipped record is left out
         assert np.asarray(lines[0].get_ydata()) == pytest.approx([scale * abs(i - 2.5) for i in (2, 3, 4)])
-    smallest = panels["smallest eigenvalue"]
+    smallest = panels["−λ min"]
     hollow = [x for x in smallest.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) == "#ffffff"]
     assert [float(y) for x in hollow for y in np.asarray(x.get_ydata())] == pytest.approx(
         [1 / 2, 1 / 3, 1 / 4, 3 / 2, 1, 3 / 4]
     )
     assert list(np.asarray(panels["Gaussians"].lines[0].get_ydata())) == [2000, 3000, 4000]
     assert "a: λ max × 2.0 from step 1,000 to 2,000" in figure.get_suptitle()
+
+
+def test_trainings_of_a_method_share_its_colour_and_its_sentence(tmp_path):
+    figure = trajectory.draw(gathered([run(tmp_path / name) for name in ("3dgs/0", "3dgs/1", "stablegs/0")]))
+    looks = {x.get_label(): (x.get_color().upper(), x.get_linestyle()) for x in figure.legends[0].get_lines()[:3]}
+    assert looks == {"3dgs/0": (RUNS[0], "-"), "3dgs/1": (RUNS[0], "--"), "stablegs/0": (RUNS[1], "-")}
+    grown = rows()
+    grown.loc[grown.index[-1], "lambda_max"] = 40.0
+    figure = trajectory.draw(pd.concat([rows().assign(run="a/0"), grown.assign(run="a/1")], ignore_index=True))
+    assert figure.get_suptitle() == "a: λ max × 2.0 to 20 from step 1,000 to 2,000 (2 runs)"
+
+
+def test_a_number_that_is_0_within_round_off_is_left_off_the_logarithmic_axis():
+    table = rows().assign(run="a")
+    table.loc[1, ["trace_quats", "trace_quats_low", "trace_quats_high"]] = -7.7e-9
+    axes = {each.get_title(): each for each in trajectory.draw(table).axes}["trace of rotation"]
+    (line,) = [x for x in axes.lines if x.get_linestyle() == "-"]
+    assert np.isfinite(np.asarray(line.get_ydata(), float)).tolist() == [False, True, True]
+    assert axes.get_ylim()[0] > 1e-3
 
 
 def test_a_bound_is_an_arrow_without_a_line(tmp_path):

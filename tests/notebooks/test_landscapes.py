@@ -13,12 +13,14 @@ from PIL import Image
 
 from analysis.records.quantities import rough
 from analysis.records.records import Record, SliceRecord, read_record, record_folder, write_record
+from figures import surface
+from figures.plane import NOT_CONFIRMED
 from figures.style import RUNS
 from notebooks.landscapes import fig1, fig7
 from notebooks.landscapes.manifold import Scale, landscape_of, runs_script, start_of, window
 from tests.figures.test_figures import POINT, laid_out
 from tests.figures.test_trajectory_figure import rows
-from tests.recorded import slice_of, synthetic
+from tests.recorded import slice_of, synthetic, written
 
 
 def slice_at(run: Path, scale: float) -> None:
@@ -90,7 +92,9 @@ def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
     ends = {(axes.get_xlim(), axes.get_ylim(), axes.get_zlim()) for axes in surfaces[:2]}  # pyright: ignore[reportAttributeAccessIssue]
     assert len(ends) == 1
     wide = Scale.of(start_of(runs[0]))
-    assert surfaces[2].get_title().startswith(f"start, steps × {rough(wide.reach / reach)}\n")
+    assert (
+        surfaces[2].get_title().startswith(f"start of 3dgs,\n{rough(wide.reach / reach)} times the steps of the ends\n")
+    )
     assert surfaces[2].get_xlim()[1] == pytest.approx(wide.reach / 10.0**wide.steps)
     across, along = figure.axes[-2:]
     assert across.get_xlim() == along.get_xlim()
@@ -160,10 +164,35 @@ def test_for_a_paper_titles_are_letters_and_the_caption_lies_beside_it(runs, tmp
     caption = (tmp_path / "one.paper.txt").read_text()
     assert "(a) " in caption and caption.count("\n") == 1
     if module is fig1:
-        assert "(a) 3dgs: λ = " in caption and "(d) stablegs not scored." in caption  # as they are read
-        assert (
-            "stablegs is the flatter one" in caption and "where the paper has StableGS flatter. One training" in caption
-        )
+        said = (
+            "(a) 3dgs, step 2,000: λ max ",
+            "0.11 times that of 3dgs",
+            "(d) stablegs not scored.",
+            "stablegs is the flatter one",
+            "where the paper has StableGS flatter. One training",
+        )  # as they are read
+        assert [words for words in said if words not in caption] == []
+
+
+def test_a_largest_eigenvalue_that_renders_do_not_confirm_is_said_to_be_so(runs):
+    for run, confirmed in zip(runs, (True, False), strict=True):
+        data, arrays = synthetic()
+        renders = {"confirmed": confirmed, "steps": [1e-3], "ratios": [1.0], "errors": [0.1]}
+        data["eigenvalues"]["max"]["renders"] = renders
+        written(run / "probe", data, arrays)
+    first, second = (axes.get_title() for axes in fig1.draw(runs).axes if hasattr(axes, "get_zlim"))
+    assert NOT_CONFIRMED not in first and NOT_CONFIRMED in second
+    assert surface._doubt(read_record(runs[0] / "probe")) == "" and NOT_CONFIRMED in surface._doubt(
+        read_record(runs[1] / "probe")
+    )
+
+
+def test_sections_fill_their_axes(runs):
+    across = [axes for axes in fig1.draw(runs).axes if axes.get_xlabel().startswith("step along e₁, e₂")]
+    seen = np.concatenate([np.ma.filled(np.ma.asarray(x.get_ydata())[abs(np.asarray(x.get_xdata())) <= axes.get_xlim()[1]], 0)
+                           for axes in across for x in axes.lines])  # fmt: skip
+    low, high = across[0].get_ylim()
+    assert across[1].get_ylim() == (low, high) and np.ptp(seen) > 0.85 * (high - low) and low < seen.min()
 
 
 def test_the_index_is_the_recorded_one_of_each_run(runs):
