@@ -2,6 +2,7 @@
 
 import warnings
 from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -15,7 +16,7 @@ from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, Record
 from figures.plane import NOT_CONFIRMED, plane, same_scale
 from figures.scripts import script
-from figures.slice2d import RENDERED
+from figures.slice2d import FAINT
 from figures.style import BLACK, FIELD_MAP, new_figure, style
 from landscape.errors import InputError
 
@@ -39,25 +40,14 @@ def draw(record: Record) -> Figure:
     with style():
         figure = new_figure(2.6)
         axes: Axes3D = figure.add_subplot(projection="3d", computed_zorder=False)  # pyright: ignore[reportAssignmentType]
-        levels = MaxNLocator(LEVELS).tick_values(low, top)
-        axes.contour(
-            x,
-            y,
-            height,
-            levels=levels,
-            zdir="z",
-            offset=low,
-            colors="0.7",
-            linewidths=0.4,
-            linestyles="solid",
-            zorder=0,
-        )
+        lines: dict[str, Any] = {"levels": MaxNLocator(LEVELS).tick_values(low, top), "linestyles": "solid"}
+        axes.contour(x, y, height, zdir="z", offset=low, colors="0.7", linewidths=0.4, zorder=0, **lines)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Z contains NaN")  # it has no surface there, as it should
             axes.plot_surface(x, y, height, rcount=len(x), ccount=len(y[0]), cmap=FIELD_MAP, vmin=low, vmax=top,
                               linewidth=0, antialiased=False)  # fmt: skip
-        axes.contour(x, y, height, levels=levels, colors=BLACK, linewidths=0.3, linestyles="solid")
-        axes.plot(x[dots], y[dots], height[dots], **RENDERED)
+        axes.contour(x, y, height, colors=BLACK, linewidths=0.3, **lines)
+        axes.plot(x[dots], y[dots], height[dots], **FAINT)
         axes.set(xlim=field.x.scaled[[0, -1]], ylim=field.y.scaled[[0, -1]], zlim=(low, top))
         axes.set_xlabel(field.x.short_label, labelpad=-6)
         axes.set_ylabel(field.y.short_label, labelpad=-6)

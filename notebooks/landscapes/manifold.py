@@ -224,7 +224,8 @@ def section(axes: Axes, landscape: Plane, scale: Scale, axis: int, **look: objec
     axes.plot(steps / 10.0**scale.steps, rise / 10.0**scale.loss, **look)  # pyright: ignore[reportArgumentType]
     reach, loss = scale.reach / 10.0**scale.steps, 10.0**scale.loss
     axes.set(xlim=(-reach, reach), ylim=(scale.low / loss, scale.high / loss))
-    axes.xaxis.set_major_locator(MaxNLocator(4))
+    for each in (axes.xaxis, axes.yaxis):
+        each.set_major_locator(MaxNLocator(4))
     axes.grid(True)
 
 
