@@ -97,7 +97,7 @@ def finding(direction: Direction, change: np.ndarray, model: np.ndarray | None) 
 def times(ratios: np.ndarray) -> str:
     """The range of ratios in words.
 
-    >>> times(np.array([1.57, 2.15, 1.12])), times(np.array([2.0]))
+    >>> times(np.array([1.57, 2.16, 1.12])), times(np.array([2.0]))
     ('1.1 to 2.2 times', '2.0 times')
     """
     return " to ".join(dict.fromkeys(map(rough, (float(ratios.min()), float(ratios.max()))))) + " times"

@@ -142,7 +142,7 @@ def test_the_colours_of_the_surfaces_have_bars_and_open_dots_a_word(runs):
     for bar, scale in zip(bars, (ends, start), strict=True):
         assert bar.get_ylim() == pytest.approx((scale.low / 10.0**scale.loss, scale.high / 10.0**scale.loss))
     words = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert words == ["3dgs", "stablegs", "start", "open: the number is negative"]
+    assert words == ["3dgs", "stablegs", "start", "open: the number is negative", fig7.UNIT]
 
 
 def test_a_figure_makes_the_folder_that_it_is_written_to(runs, tmp_path, monkeypatch):
