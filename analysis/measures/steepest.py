@@ -200,7 +200,11 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
     if max(abs(each - 1) for each in factors) <= AGREES:
         return f"{text}."
     low, high = quantity(min(factors)), quantity(max(factors))
-    return f"{text}; over {extent} by {low} to {high} times what the curvature has."
+    beyond = sum(not 0.5 <= factor <= 2 for factor in factors)
+    verdict = (
+        f"outside of 1/2 to 2 at {beyond} of {len(factors)}, where they refute it" if beyond else "all within 1/2 to 2"
+    )
+    return f"{text}; over {extent} by {low} to {high} times what the curvature has, {verdict}."
 
 
 def _carrier(

@@ -269,10 +269,10 @@ class Shade(Struct, frozen=True, kw_only=True):
         stops = ", ".join(
             "rgb({}, {}, {})".format(*colour) for colour in self.palette[np.linspace(0, BYTES, 9, dtype=int)]
         )
-        ends, way = [quantity(self.value(t)) for t in (self.low, self.high)], "right"
+        ends, way = [rough(self.value(t)) for t in (self.low, self.high)], "right"
         if self.falls:
             ends, way = ends[::-1], "left"
-        middle = "<span>logarithmic</span>" if self.scale == "log" else ""
+        middle = "<span class=scale>logarithmic</span>" if self.scale == "log" else ""
         return (
             f'<span style="display:block;height:.5em;background:linear-gradient(to {way}, {stops})"></span><span '
             f'style="display:flex;gap:.5em;justify-content:space-between"><span>{ends[0]}</span>{middle}<span>{ends[1]}</span></span>'

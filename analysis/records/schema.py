@@ -129,7 +129,7 @@ class LivesOn(Struct, kw_only=True):
 
     attributes: shares of the squared mass |v|^2.  participation: over how many Gaussians it is spread.  needles, needles_bare:
     share of it on Gaussians with a condition number above 100, with and without the blur of 0.3 px^2; needle_count,
-    needle_bare_count: the number of those.  heaviest: (index, share) of single Gaussians, the largest share first.
+    needle_bare_count: the number of those.  heaviest: (number among all, share) of Gaussians, the largest share first.
     """
 
     attributes: dict[str, Portion] = {}

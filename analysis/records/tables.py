@@ -12,7 +12,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from analysis.records.findings import attribute_name, is_open, is_wide, resolved
-from analysis.records.quantities import HARD, PLUS_MINUS, UNDETERMINED, apart, limits, measured, percent, quantity
+from analysis.records.quantities import (
+    HARD,
+    PLUS_MINUS,
+    UNDETERMINED,
+    apart,
+    limits,
+    measured,
+    percent,
+    quantity,
+    rough,
+)
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import INDICES, BlockAnisotropy, BlockShare, Depth, Effect, End, FiniteProbe, Index, Number
 
@@ -104,7 +114,9 @@ def _end_rows(data: ProbeRecord) -> Iterator[Row]:
             f"{where.needle_count:,} of {data.counts.visible_gaussians:,} Gaussians in sight, of the steepest direction"
         )
         yield "share on needles", percent(where.needles), among
-        yield "Gaussians it is spread over", quantity(where.participation), ""
+    for name, of in (("max", "e₁"), ("min", "eₘᵢₙ")):
+        if where := getattr(data.eigenvalues, name).lives_on:
+            yield f"Gaussians that {of} is spread over", rough(where.participation), ""
 
 
 def _index_rows(data: ProbeRecord) -> Iterator[Row]:
@@ -124,21 +136,21 @@ def _check_rows(checks: Mapping[str, Check]) -> Iterator[Row]:
     for name, check in checks.items():
         outcome = {None: "could not run", True: "passed", False: "FAILED"}[check.passed]
         note = f" ({check.note})" if check.note else ""
-        yield (
-            f"check: {name.replace('_', ' ')}",
-            quantity(check.value),
-            f"{outcome}, at most {quantity(check.bound)}{note}",
-        )
+        yield (name.replace("_", " "), quantity(check.value), f"{outcome}, at most {quantity(check.bound)}{note}")
 
 
 def _finite_rows(probe: FiniteProbe | None) -> Iterator[Row]:
-    """Rows of the second differences, at the steps where round-off does not hide them."""
+    """Rows of the second differences, at the steps where round-off does not hide them; the others are counted."""
     if probe is not None:
+        if probe.infinitesimal is not None:
+            yield "curvature at 0 (infinitesimal)", quantity(probe.infinitesimal), ""
         columns = probe.steps, probe.curvatures, probe.round_off, probe.truncation, resolved(probe)
         for step, value, rounded, truncated, sure in zip(*columns, strict=True):
             if sure:
                 error = math.hypot(*(math.inf if each is None else each for each in (rounded, truncated)))
                 yield f"curvature at ±{quantity(step)}", measured(value, error), ""
+        if hidden := [quantity(step) for step, sure in zip(probe.steps, resolved(probe), strict=True) if not sure]:
+            yield "hidden by round-off", f"{len(hidden)} steps", f"±{', ±'.join(hidden)}"
 
 
 def _reason(reason: str | None) -> str:
@@ -277,7 +289,7 @@ def bracketed(index: Index | None) -> Cell:
         return Cell(f"≥ {quantity(low)}" if high is None else f"≤ {quantity(high)}", "", note)
     if value is not None and low <= value <= high and high - low < NARROW * abs(value):
         return Cell(measured(value, max(high - value, value - low)), "", note)
-    return Cell(UNDETERMINED if is_wide(index) else quantity(value), limits(low, high), note)
+    return Cell(UNDETERMINED if is_wide(index) else rough(value), limits(low, high), note)
 
 
 def factor(effect: Effect | None) -> Cell:

@@ -28,6 +28,7 @@ from landscape.errors import InputError
 from splat.model.untrusted import replacing
 
 TABLE, PICTURE = "trajectories.csv", "trajectories.png"
+ROUND_OFF = 2.0**-21  # of a trace in single precision, over the largest of the same record
 VALUES = {f"trace_{name}": f"trace of {attribute_name(name)}" for name in ATTRIBUTES} | ENDS
 
 
@@ -42,6 +43,10 @@ def run_trajectory(options: TrajectoryOptions) -> int:
     with replacing(path) as partial:
         table.to_csv(partial, index=False, errors="backslashreplace")
     console.print(first_and_last(table))
+    say(
+        "* renders confirm no end of these records, which the ratio rests on: landscape probe makes them",
+        console=console,
+    )
     if len(versions := table.filter(["of_formulas"]).dropna().drop_duplicates()) > 1:
         say(f"records of {len(versions)} versions of the formulas do not compare: train again", style="yellow")
     (out / PICTURE).unlink(missing_ok=True)
@@ -110,10 +115,20 @@ def first_and_last(table: pd.DataFrame) -> Table:
         )
         result.add_row("Gaussians", *(f"{end['gaussians']:,}" for end in ends))
         for key, title in VALUES.items():
-            result.add_row(title, *(measured(_known(end[key]), _known(end[f"{key}_error"])) for end in ends))
+            result.add_row(title, *(_measured(end, key) for end in ends))
         for key in TRAJECTORY_INDICES:
-            result.add_row(key.replace("_", " "), *(_bracketed(end, key) for end in ends))
+            mark = "*" if key.endswith("_ratio") and key != "participation_ratio" else ""
+            result.add_row(key.replace("_", " ") + mark, *(_bracketed(end, key) for end in ends))
     return result
+
+
+def _measured(row: Mapping[str, Any], key: str) -> str:
+    """Value and error; 0 for an exact trace that round-off alone may have made."""
+    value, error = _known(row[key]), _known(row[f"{key}_error"])
+    traces = [abs(_known(row[name]) or 0.0) for name in VALUES if name not in ENDS]
+    if key not in ENDS and value is not None and error == 0 and abs(value) <= ROUND_OFF * max(traces):
+        return quantity(0.0)
+    return measured(value, error)
 
 
 def _bracketed(row: Mapping[str, Any], key: str) -> str:

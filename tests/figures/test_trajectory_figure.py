@@ -11,7 +11,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 from analysis.commands.cli import main
-from analysis.runs.trajectories import gathered
+from analysis.runs.trajectories import first_and_last, gathered
 from analysis.train.trajectory import COLUMNS
 from figures import trajectory
 from figures.style import RUNS
@@ -144,9 +144,18 @@ def test_the_command_prints_first_and_last_values_and_writes_the_files(tmp_path,
     lines = [line.split() for line in said.splitlines()]
     assert ["3dgs/0", "(1", "skipped)", "step", "1,000", "(whole)", "step", "2,000", "(whole)"] in lines
     assert ["largest", "eigenvalue", "2.00", "±", "0.10", "4.00", "±", "0.10"] in lines
-    place = lines.index(["eigenvalue", "ratio", "−4.00", "−16.0"]) + 1
+    place = lines.index(["eigenvalue", "ratio*", "−4.00", "−16.0"]) + 1
+    assert said.count("* renders confirm no end of these records") == 1
     assert lines[place] == ["−4.40", "to", "−3.60", "−17.6", "to", "−14.4"]
     assert ["participation", "ratio", "≥", "10.0", "≥", "20.0"] in lines  # of which nothing else is certain
+
+
+def test_an_exact_trace_that_round_off_may_have_made_is_printed_as_zero():
+    table = rows().iloc[[1, 3]].assign(run="a")
+    table["trace_means"], table["trace_means_error"] = [-1e-9, 1e-9], [0.0, 1e-10]
+    columns = [[*column.cells] for column in first_and_last(table).columns]
+    first, last = (column[columns[0].index("trace of position")] for column in columns[1:])
+    assert first == "0" and last.startswith("(1.0")  # which has an error, by which it is not 0
 
 
 def test_a_figures_script_given_something_else_says_what_it_expects(tmp_path):

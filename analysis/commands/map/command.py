@@ -13,6 +13,7 @@ Everything is computed on the CPU.  The ends of a map's scale are percentiles ov
 the images.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -180,8 +181,9 @@ def _conclude(data: MapRecord, first: Mapping[str, Any], kind: Field, out: Path)
     say(f"{data.seen:,} of {data.gaussians:,} Gaussians are in sight", *data.sentences)
     if not data.steepest:
         say("for the Gaussians that carry the steepest directions: landscape probe, then map again")
-    say(f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {in_words(kind, float(first[data.field]))}")
+    most = f"most of it at Gaussian {int(first['gaussian']):,}"
+    say(f"of each Gaussian by itself, {kind.words}: {most}, {in_words(kind, float(first[data.field]))}")
     say(*data.notes, style="yellow")
-    pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))[:4]) or "none"
-    more = "" if len(data.panels) <= 4 else ", ..."
-    say(f"pictures: {pictures}{more}; splats: fields.ply, {data.field}.ply; table: top.csv; in {out}")
+    names = [re.sub(r"-\d{3,}[.]", "-NNN.", path.name) for path in sorted(out.glob("*.png"))]
+    pictures = ", ".join(dict.fromkeys(names)) or "none"
+    say(f"pictures: {pictures}; splats: fields.ply, {data.field}.ply; table: top.csv; in {out}")

@@ -25,7 +25,7 @@ from analysis.records.findings import Line, attribute_name, findings, shares_per
 from analysis.records.json_files import plain
 from analysis.records.page.summary import told
 from analysis.records.provenance import Provenance
-from analysis.records.quantities import exponent_of, percent, quantity, ratio, unit_suffix
+from analysis.records.quantities import exponent_of, percent, quantity, ratio, rough, unit_suffix
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map, read_maps
 from analysis.records.schema import INDICES
@@ -50,6 +50,31 @@ COMPARED = (  # of the traces, where the record has these steps
     "compares; beside the names their traces, each in its own unit."
 )
 PIXEL = "1 px along the ray: a way as long as the one that moves a splat by a pixel where it is across the ray."
+GLOSSARY = {  # of the words that a page uses
+    "unit": "of the parameters: world units, logarithms of scales, unit quaternions, logits of opacity, SH coefficients; "
+    "curvature is loss per squared unit",
+    "curvature unit": "of a direction: the step over which its curvature alone changes the loss by as much as is said",
+    "e₁": "unit vector over all parameters along which the curvature is largest (λ max)",
+    "e₂": "the same, of the second largest curvature",
+    "eₘᵢₙ": "the same, of the smallest curvature (λ min)",
+    "block": "the part of the Hessian that concerns one Gaussian, or one attribute, alone",
+    "trace": "the sum of a block's curvatures in all its directions",
+    "τ": "the square root of a block's mean curvature",
+    "dim": "number of directions of a block; of colours, of those that some view sees",
+    "rank": "number of directions of the parameters that are not exactly flat",
+    "kinks": "points at which L1's slope jumps: the curvature that they make over finite steps is not in the Hessian",
+    "optimiser's step": "as long as the first that Adam takes, of random signs: the learning rate in every parameter",
+    "participation ratio": "(sum of |curvature|)² over the sum of its squares: over how many directions curvature is spread",
+    "quadrature width": "of the sum of |curvature|: the mean distance of its two bounds, over the start vectors",
+    "start vector": "random vector from which the density is made; each gives an estimate of its own",
+    "order changed": "some splats lie in another order along their rays than in the checkpoint, which derivatives do not see",
+    "matvec budget": "largest number of products of the Hessian with a vector that a search may use",
+    "condition": "of a splat: its longer axis in the picture over the shorter one, squared; above 100 it is a needle",
+    "in sight": "drawn in a training view",
+    "the paper": "Zhao et al., “Geometric Probing for Isotropic Optimization Manifold in Sparse-View 3D Gaussian Splatting” "
+    "(StableGS)",
+    "carries": "has a part of the squared length of a direction, or of the sum of all curvatures",
+}
 OPTION = re.compile(r"--[a-z][a-z-]*")  # of a command, which a page must not break
 ROOM, SMALLEST = 3.0, 6  # of the part around an outline: in its half length; at least 1 / SMALLEST of the picture
 PACKED = 4  # level of gzip of plotly.js: at the usual 6 it takes twice as long for 4% fewer bytes
@@ -79,6 +104,7 @@ def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environ
     environment.filters |= {
         "quantity": quantity,
         "cell": _cell,
+        "rough": rough,
         "coded": lambda text: OPTION.sub(r"<code>\g<0></code>", html.escape(text)),
         "capitalise": lambda words: words[:1].upper() + words[1:],
     }
@@ -97,7 +123,8 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
     """Pictures and plotly.js are compressed in parallel."""
     data, run = record.data, record.folder.parent
     surface = interactive_surface(record)
-    lines = told(data)
+    lines, numbers = told(data), number_rows(data)
+    numbers.pop("Sizes", None)  # the counts have them
     captions = PICTURES | ({"traces": COMPARED} if shares_per_trace(data) else {})
     with ThreadPoolExecutor() as pool:
         packed = pool.submit(_packed_plotly) if surface else None
@@ -110,15 +137,15 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
     if views:  # the pictures of this view are in the page once, as images; the script reads them from there
         listed[start] = views[start] | {"pictures": [each | {"uri": ""} for each in views[start]["pictures"]]}
     template = template_environment().get_template("report.html.jinja")
-    return template.render(
+    text = template.render(
         data=data,
-        counts=plain(data.counts) | {"left out": plain(data.skipped)},
+        counts=plain(data.counts) | {"left out": {k: v for k, v in plain(data.skipped).items() if v["count"]}},
         provenance=_told(data.provenance),
         subtitle=subtitle(data),
         lines=lines,
         place=place_of(record, views) if "steepest" in lines else None,
         findings=said,
-        numbers=number_rows(data),
+        numbers=numbers,
         views=views,
         listed_views=listed,
         start=start,
@@ -131,6 +158,11 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
         surface=surface,
         plotly_js=packed.result() if packed else "",
     )
+    shown = html.unescape(re.sub(r"<(style|script)>.*?</\1>|<[^>]*>", " ", text, flags=re.DOTALL))
+    used = [
+        f"<dt>{term}</dt><dd>{words}</dd>" for term, words in GLOSSARY.items() if re.search(rf"(?<!\w){term}", shown)
+    ]
+    return text.replace('<dl id="glossary">', "\n".join(['<dl id="glossary">', *used]), 1)
 
 
 def _told(made: Provenance) -> dict[str, Any]:

@@ -85,10 +85,15 @@ def test_pictures_are_drawn_of_the_views_that_were_asked_for(folder):
         assert Image.open(folder / "map" / f"{panel.file}.png").width > 800
 
 
-def test_a_run_folder_is_mapped_like_the_file_it_was_made_of(folder):
+def test_a_run_folder_is_mapped_like_the_file_it_was_made_of(folder, capsys):
     run = str(folder / "run" / "checkpoint.pt")
     words = [str(folder / "in.ply"), run, "--scene", str(folder / "scene"), "--views", "all"]
     assert main(["convert", *words]) == 0 and main(["map", str(folder / "run"), "--draw", "0"]) == 0
+    said = capsys.readouterr().out  # every file by its name or its pattern, once
+    assert (
+        "pictures: fragility-NNN.png, view-NNN.png; splats" in said
+        and "of each Gaussian by itself, largest curv" in said
+    )
     found, before = (read_map(path / "map") for path in (folder / "run", folder))
     assert (found.fragility, found.shades, found.sentences) == (before.fragility, before.shades, before.sentences)
 

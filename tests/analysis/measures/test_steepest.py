@@ -105,6 +105,14 @@ def test_only_what_renders_bear_out_is_said_of_a_curvature(curvature, factors, s
     assert rendered_sentence(end, 2.0, STEPS, factors).startswith(said)
 
 
+def test_a_factor_beyond_a_half_to_two_is_said_to_refute_the_curvature():
+    end = End("e", "an end", torch.zeros(1), 4.0)
+    assert rendered_sentence(end, 2.0, STEPS, [3.0, 0.4, 1.0]).endswith(
+        "outside of 1/2 to 2 at 2 of 3, where they refute it."
+    )
+    assert rendered_sentence(end, 2.0, STEPS, [1.9, 0.6, 1.0]).endswith("what the curvature has, all within 1/2 to 2.")
+
+
 def test_steps_change_the_loss_as_the_curvature_has_it(shown):
     objective, end, found, pictures = shown
     low, middle, high = found.losses

@@ -151,6 +151,8 @@ def test_needles_and_finite_steps_have_rows_where_they_are_known():
     steps = {name: soft(value) for name, (value, _) in found.items() if name.startswith("curvature at ±")}
     # round-off hides the curvature at the first step
     assert list(steps.values()) == ["41.0 ± 4.1", "55.0 ± 1.0", "70.0 ± ?"]
+    assert found["hidden by round-off"][0] == "1 steps" and found["Gaussians that e₁ is spread over"][0] == "1.8"
+    assert "curvature at 0 (infinitesimal)" in found and "Gaussians that eₘᵢₙ is spread over" not in found
 
 
 def test_of_depth_only_what_was_determined_has_a_number():

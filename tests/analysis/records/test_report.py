@@ -15,7 +15,7 @@ from rich.console import Console
 
 from analysis.records.findings import findings
 from analysis.records.json_files import plain
-from analysis.records.page.report import interactive_surface, write_report
+from analysis.records.page.report import GLOSSARY, interactive_surface, write_report
 from analysis.records.page.summary import summary
 from analysis.records.quantities import exponent_of
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
@@ -238,7 +238,7 @@ def test_the_page_sets_depth_against_the_papers_factor(tmp_path):
     text = Page(page(tmp_path / "with", data | {"depth": depth_section()}, arrays)).text
     for expected in (
         "depth gradient / lateral 0.00680",
-        "of the gradient the paper says about 100",
+        "the paper says that depth is about 100 times lateral; here it is 0.0068 times",
         "depth curvature / lateral (3.80 ± 0.10) × 10⁻⁵",
         "depth / lateral rise, 0.1 px 0.280 ± 0.020",
         "20.4 ± 0.3",
@@ -246,6 +246,18 @@ def test_the_page_sets_depth_against_the_papers_factor(tmp_path):
         "23,054 pairs",
     ):
         assert expected in text
+
+
+def test_the_glossary_has_the_words_that_the_page_uses_and_no_others(tmp_path):
+    data, arrays = synthetic()
+    plain_page = page(tmp_path / "plain", data, arrays)
+    deep = page(tmp_path / "deep", data | {"depth": depth_section()}, arrays)
+    for term, words in GLOSSARY.items():
+        for text in (plain_page, deep):
+            entry = f"<dt>{term}</dt><dd>{words}</dd>"
+            used = term in Page(text.replace(entry, "")).text
+            assert (entry in text) == used or term in ("unit", "rank", "dim", "block", "trace"), term  # within words
+    assert "<dt>the paper</dt>" in deep and "<dt>the paper</dt>" not in plain_page
 
 
 def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
