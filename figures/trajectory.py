@@ -54,7 +54,7 @@ def draw(table: pd.DataFrame) -> Figure:
     methods: dict[str, list[str]] = {}
     for name in map(str, table["run"].unique()):
         methods.setdefault(name.rpartition("/")[0] or name, []).append(name)
-    runs = {
+    runs: dict[str, dict[str, Any]] = {
         name: {"color": RUNS[i % len(RUNS)], "linestyle": LINES[k % len(LINES)]}
         for i, names in enumerate(methods.values())
         for k, name in enumerate(names)
@@ -62,7 +62,7 @@ def draw(table: pd.DataFrame) -> Figure:
     with style():
         figure = new_figure(PANEL * 3 + LEGEND_LINE * (len(methods) + len(runs) + 6))
         for axes, (name, title) in zip(figure.subplots(3, 2).flat, PANELS.items(), strict=True):
-            axes.set_title(NEGATIVE if name == "lambda_min" and (measured[name].dropna() < 0).all() else literal(title))
+            axes.set_title(NEGATIVE if name == "lambda_min" and float(measured[name].max()) < 0 else literal(title))
             over_steps(axes, measured, runs, name)
             axes.grid(True)
             axes.xaxis.set_major_locator(step_ticks())
@@ -91,7 +91,7 @@ def with_ends(measured: pd.DataFrame) -> pd.DataFrame:
 
 def _happened(method: str, runs: list[str], measured: pd.DataFrame) -> str:
     """What became of the steepest curvature in the trainings of a method, in words."""
-    known = [measured[(measured["run"] == run) & (measured["lambda_max"] > 0)] for run in runs]
+    known = [pd.DataFrame(measured[(measured["run"] == run) & (measured["lambda_max"] > 0)]) for run in runs]
     if min(map(len, known)) < 2:
         return literal(f"{method}: one record of λ max")
     grown = sorted(float(each["lambda_max"].iloc[-1] / each["lambda_max"].iloc[0]) for each in known)
@@ -106,7 +106,7 @@ def step_ticks() -> MaxNLocator:
     return MaxNLocator(4, integer=True, steps=[1, 2, 2.5, 5, 10])
 
 
-def over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, dict[str, str]], name: str) -> None:
+def over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, dict[str, Any]], name: str) -> None:
     """A number of every run over the steps, its magnitude on a logarithmic axis, with its interval.  runs: name -> look.
 
     Hollow where it is negative.  Of one with only a lower bound an arrow stands on that, without a line; without one, nothing.

@@ -77,7 +77,9 @@ def draw(runs: Sequence[Path]) -> Figure:
             if i == 0:
                 across.set_ylabel(sections.loss_label)
             else:
-                above.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=filled.levels[1::2])
+                above.colorbar(
+                    filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=np.asarray(filled.levels)[1::2]
+                )
         handles = [Line2D([], [], color=colour, label=f"along {name}") for name, colour in ALONG.items()]
         handles.append(Line2D([], [], linestyle="none", label="one training each"))
         figure.set_label(_caption(names, landscapes))
