@@ -62,9 +62,8 @@ def draw(table: pd.DataFrame) -> Figure:
     with style():
         figure = new_figure(PANEL * 3 + LEGEND_LINE * (len(methods) + len(runs) + 6))
         for axes, (name, title) in zip(figure.subplots(3, 2).flat, PANELS.items(), strict=True):
-            axes.set_title(
-                NEGATIVE if name == "lambda_min" and not (measured[name].to_numpy(float) >= 0).any() else literal(title)
-            )
+            negative = name == "lambda_min" and not (np.asarray(measured[name], dtype=float) >= 0).any()
+            axes.set_title(NEGATIVE if negative else literal(title))
             over_steps(axes, measured, runs, name)
             axes.grid(True)
             axes.xaxis.set_major_locator(step_ticks())

@@ -106,7 +106,8 @@ def changes_by_steps(data: ProbeRecord) -> dict[str, tuple[float, float]]:
         }
     else:
         shares, traces = shares_per_trace(data), data.traces
-        ends = {name: tuple(share * x for x in traces[name].magnitudes) for name, share in shares.items()}
+        sizes = {name: (share, *traces[name].magnitudes) for name, share in shares.items()}
+        ends = {name: (share * least, share * most) for name, (share, least, most) in sizes.items()}
     return dict(sorted(ends.items(), key=lambda each: -sum(each[1])))
 
 

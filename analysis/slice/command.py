@@ -230,7 +230,7 @@ def _conclude(data: SliceRecord, out: Path) -> None:
         say(_finite_curvature(data.finite_probe))
     say(*(line.text for line in of_slice(data.slice, data.provenance)))
     say(*data.notes, style="yellow")
-    say(f"{data.timing['total']:.1f} s, {data.counts.renders:,} renders of a view")
+    say(f"{data.timing.get('total', 0.0):.1f} s, {data.counts.renders:,} renders of a view")
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))) or "none"
     say(f"pictures: {pictures}; numbers: {data.FILE}, in {out}")
 

@@ -78,7 +78,7 @@ def draw(runs: Sequence[Path]) -> Figure:
                 across.set_ylabel(sections.loss_label)
             else:
                 above.colorbar(
-                    filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=np.asarray(filled.levels)[1::2]
+                    filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=list(np.asarray(filled.levels)[1::2])
                 )
         handles = [Line2D([], [], color=colour, label=f"along {name}") for name, colour in ALONG.items()]
         handles.append(Line2D([], [], linestyle="none", label="one training each"))

@@ -57,10 +57,10 @@ def read_prediction(path: Path) -> pd.DataFrame:
 def answers(rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each time and measure with the columns COLUMNS, where there is something to say."""
     ends = rows[rows["at"] == "end"]
-    collapsed = pd.MultiIndex.from_frame(ends.loc[ends["psnr_train"] < COLLAPSED, KEYS[:3]])
-    kept = rows[~pd.MultiIndex.from_frame(rows[KEYS[:3]]).isin(collapsed)]
+    collapsed = pd.MultiIndex.from_frame(pd.DataFrame(ends.loc[ends["psnr_train"] < COLLAPSED, KEYS[:3]]))
+    kept = pd.DataFrame(rows[~pd.MultiIndex.from_frame(pd.DataFrame(rows[KEYS[:3]])).isin(collapsed)])
     lines = []
-    for at in sorted(kept["at"].unique(), key=lambda at: (at == "end", at)):
+    for at in sorted({*kept["at"]}, key=lambda at: (at == "end", at)):
         some = pd.DataFrame(kept[kept["at"] == at])
         reached = pd.DataFrame(some[some["reached"].astype(bool)])
         table = pd.DataFrame(_lines(reached))
@@ -101,7 +101,8 @@ def _lines(rows: pd.DataFrame) -> Iterator[dict]:
     """Of one time.  rows: of the trainings that got there."""
     for name in MEASURES:
         known = rows.dropna(subset=[name, SCORE, *CONTROLS])
-        known = pd.DataFrame(known[known.groupby("scene")["scene"].transform("size") >= LEAST])
+        sizes = known["scene"].map(known["scene"].value_counts())
+        known = pd.DataFrame(known[sizes >= LEAST])
         values = known[[name, SCORE, *CONTROLS]].to_numpy(float)
         scenes, cells = (pd.factorize(known[key])[0] for key in ("scene", "cell"))
         tau, error, clusters = jackknife(values, scenes, cells)
@@ -160,7 +161,7 @@ def draw_prediction(table: pd.DataFrame) -> Figure:
         for axes, at in zip(figure.subplots(1, len(times), sharey=True, squeeze=False)[0], times, strict=True):
             axes.axvspan(-LARGE, LARGE, color=MISSING, alpha=0.5, linewidth=0)
             axes.axvline(0, color="0.5", linewidth=0.6)
-            for line in table[table["at"] == at].to_dict("records"):
+            for line in pd.DataFrame(table[table["at"] == at]).to_dict("records"):
                 place, colour = names.index(line["measure"]), COLOURS.get(line["measure"], UNDETERMINED)
                 axes.hlines(place, line["low"], line["high"], color=colour, linewidth=1.2)
                 dots = [value for name, value in line.items() if name.startswith("tau_")]
@@ -183,7 +184,7 @@ def draw_prediction(table: pd.DataFrame) -> Figure:
 
 def caption(rows: pd.DataFrame, table: pd.DataFrame) -> str:
     """What was measured and what it answers, from the numbers."""
-    ended = int((rows["at"] == "end").sum())
+    ended = sum(rows["at"] == "end")
     words = f"{ended} trainings of {rows['scene'].nunique()} scenes"
     if ended < ENOUGH:
         return f"{words}; before {ENOUGH} nothing is answered."

@@ -90,7 +90,7 @@ def test_a_node_of_either_sign_that_is_not_resolved_from_0_curves_neither_up_nor
     nodes = np.array([[-1.0, 1e-5, 0.5, 3.0], [-1.0, -1e-5, 0.6, 3.0]])
     record.arrays["spectrum"] |= {"nodes": nodes, "weights": np.full((2, 4), [0.01, 0.95, 0.03, 0.01])}
     down, up = draw_densities({"one": record}).axes
-    most = [max(float(np.max(line.get_ydata())) for line in axes.lines if len(line.get_ydata()) > 2 or line.get_alpha())
+    most = [max(float(np.max(line.get_ydata())) for line in axes.lines if np.size(line.get_ydata()) > 2 or line.get_alpha())
             for axes in (down, up)]  # fmt: skip
     assert most == pytest.approx([0.01, 0.04])
 

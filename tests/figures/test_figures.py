@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.axes._secondary_axes import SecondaryAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.contour import QuadContourSet
 from matplotlib.text import Text
 from msgspec import convert
 from PIL import Image
@@ -251,7 +252,7 @@ def test_where_the_order_changed_at_nearly_all_renders_the_legend_says_so_withou
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     assert _blue(figure) == dots
     entries = {
-        x.get_label().replace("\n", " "): x.get_marker()
+        str(x.get_label()).replace("\n", " "): x.get_marker()
         for x in slice2d._legend(plane(read_record(tmp_path / "probe")))
     }
     assert entries[f"order changed: {round(changed * 20)} of 20 renders"] == ("." if any(dots) else "None")
@@ -262,9 +263,11 @@ def test_contours_of_the_loss_are_solid_also_below_0_and_at_the_ticks_of_the_col
     arrays["slice"]["loss"] = 2 * data["slice"]["center_loss"] - arrays["slice"]["loss"]
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     axes = next(each for each in figure.axes if each.get_ylabel().startswith("step"))
-    _, loss, model = axes.collections
-    assert (loss.levels < 0).any() and [dashes for _, dashes in loss.get_linestyle()] == [None] * len(loss.levels)
-    assert model.get_linestyle()[0][1] is not None
+    loss, model = (each for each in axes.collections if isinstance(each, QuadContourSet) and not each.filled)
+    assert (np.asarray(loss.levels) < 0).any() and [dashes for _, dashes in loss.get_linestyles()] == [None] * len(
+        loss.levels
+    )
+    assert model.get_linestyles()[0][1] is not None
     (bar,) = axes.child_axes
     assert list(bar.get_yticks()) == list(loss.levels)
 

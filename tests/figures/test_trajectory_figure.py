@@ -73,7 +73,7 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
 
 def test_trainings_of_a_method_share_its_colour_and_its_sentence(tmp_path):
     figure = trajectory.draw(gathered([run(tmp_path / name) for name in ("3dgs/0", "3dgs/1", "stablegs/0")]))
-    looks = {x.get_label(): (x.get_color().upper(), x.get_linestyle()) for x in figure.legends[0].get_lines()[:3]}
+    looks = {x.get_label(): (str(x.get_color()).upper(), x.get_linestyle()) for x in figure.legends[0].get_lines()[:3]}
     assert looks == {"3dgs/0": (RUNS[0], "-"), "3dgs/1": (RUNS[0], "--"), "stablegs/0": (RUNS[1], "-")}
     grown = rows()
     grown.loc[grown.index[-1], "lambda_max"] = 40.0
@@ -155,7 +155,7 @@ def test_an_exact_trace_that_round_off_may_have_made_is_printed_as_zero():
     table["trace_means"], table["trace_means_error"] = [-1e-9, 1e-9], [0.0, 1e-10]
     columns = [[*column.cells] for column in first_and_last(table).columns]
     first, last = (column[columns[0].index("trace of position")] for column in columns[1:])
-    assert first == "0" and last.startswith("(1.0")  # which has an error, by which it is not 0
+    assert first == "0" and str(last).startswith("(1.0")  # which has an error, by which it is not 0
 
 
 def test_a_figures_script_given_something_else_says_what_it_expects(tmp_path):

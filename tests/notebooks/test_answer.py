@@ -75,10 +75,10 @@ def test_code_written_apart_finds_the_same_numbers():
     def tau(part: pd.DataFrame) -> float:
         r = np.eye(4)
         for i, j in combinations(range(4), 2):
-            r[i, j] = r[j, i] = np.sin(np.pi / 2 * kendalltau(part[columns[i]], part[columns[j]]).statistic)
+            r[i, j] = r[j, i] = np.sin(np.pi / 2 * kendalltau(part[columns[i]], part[columns[j]])[0])
         left = np.linalg.solve(r[2:, 2:], r[2:, :2]).T
         over = lambda i, j: r[i, j] - left[i] @ r[2:, j]  # noqa: E731
-        return 2 / np.pi * np.arcsin(over(0, 1) / np.sqrt(over(0, 0) * over(1, 1)))
+        return float(2 / np.pi * np.arcsin(over(0, 1) / np.sqrt(over(0, 0) * over(1, 1))))
 
     def mean(part: pd.DataFrame) -> float:
         return float(np.mean([tau(runs) for _, runs in part.groupby("scene")]))
@@ -122,7 +122,7 @@ def test_a_table_a_figure_and_a_caption_are_written(tmp_path):
     }  # fmt: skip
     said = (tmp_path / "caption.md").read_text()
     assert "576 trainings of 6 scenes" in said and "predicts: end: trace" in said
-    few = rows[rows["cell"].isin(CELLS[:3])]
+    few = pd.DataFrame(rows[rows["cell"].isin(CELLS[:3])])
     [table, caption] = make(few, tmp_path / "few")
     assert "nothing is answered" in caption.read_text() and table.read_text().count("\n") == 1
 
