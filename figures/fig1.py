@@ -1,6 +1,6 @@
 """Figure after the paper's Fig. 1: two landscapes side by side, and what the two scenes look like from a view held out.
 
-`python -m notebooks.landscapes.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint
+`python -m figures.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint
 along the two steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1, e_2), under its step,
 the largest eigenvalue, how many times that of the first run it is, and whether renders confirm it (by the probe, if there is
 one); below, the photograph of the first view that both have rendered, and both renders with their PSNR.  Both share their axes
@@ -19,11 +19,8 @@ from matplotlib.lines import Line2D
 from analysis.console.failures import program
 from analysis.records.quantities import rough
 from analysis.records.run_files import METRICS, read_scores
-from figures.plane import Plane
-from figures.style import BLUE, VERMILION, literal, new_figure, style
-from landscape.errors import InputError
-from notebooks.landscapes.fig7 import names_of, read_all
-from notebooks.landscapes.manifold import (
+from figures.fig7 import names_of, read_all
+from figures.manifold import (
     Scale,
     contours,
     doubt_of,
@@ -34,6 +31,9 @@ from notebooks.landscapes.manifold import (
     section,
     surface,
 )
+from figures.plane import Plane
+from figures.style import BLUE, VERMILION, literal, new_figure, style
+from landscape.errors import InputError
 
 RENDERS, PANELS = "test", "panels"
 WIDTH = 4.8  # inches

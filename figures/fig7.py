@@ -1,6 +1,6 @@
 """Figure after the paper's Fig. 7: the anisotropy index over two trainings, where they ended, and where they began.
 
-`python -m notebooks.landscapes.fig7 RUN_3DGS RUN_STABLEGS --out fig7.png`.  Above: |lambda_max / lambda_min| (Eq. (3); open:
+`python -m figures.fig7 RUN_3DGS RUN_STABLEGS --out fig7.png`.  Above: |lambda_max / lambda_min| (Eq. (3); open:
 negative) with its bracket, of records of a training, which confirm no end by renders, and the loss around both checkpoints
 along the two steepest eigenvectors.  Below: the same around the start of the first run, and sections through all three along
 e_1 and e_2.  All axes are those of the two ends (`manifold`), but for the start's surface, whose title says how much farther it
@@ -19,18 +19,10 @@ from matplotlib.lines import Line2D
 from analysis.console.failures import program
 from analysis.records.quantities import rough
 from analysis.records.run_files import RECORDS, read_trajectory
+from figures.manifold import Scale, landscape_of, require_same_function, runs_script, section, start_of, surface
 from figures.style import BLUE, RUNS, literal, new_figure, style
 from figures.trajectory import marker_words, over_steps, step_ticks
 from landscape.errors import InputError
-from notebooks.landscapes.manifold import (
-    Scale,
-    landscape_of,
-    require_same_function,
-    runs_script,
-    section,
-    start_of,
-    surface,
-)
 
 PAGE = 6.9  # inches
 BEGINNING, UNIT = "start", "e₁, e₂: units of the parameters"

@@ -13,11 +13,10 @@ from PIL import Image
 
 from analysis.records.quantities import rough
 from analysis.records.records import Record, SliceRecord, read_record, record_folder, write_record
-from figures import surface
+from figures import fig1, fig7, surface
+from figures.manifold import Scale, landscape_of, runs_script, start_of, window
 from figures.plane import NOT_CONFIRMED
 from figures.style import RUNS
-from notebooks.landscapes import fig1, fig7
-from notebooks.landscapes.manifold import Scale, landscape_of, runs_script, start_of, window
 from tests.figures.test_figures import POINT, laid_out
 from tests.figures.test_trajectory_figure import rows
 from tests.recorded import slice_of, synthetic, written
