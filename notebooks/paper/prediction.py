@@ -101,8 +101,8 @@ def _lines(rows: pd.DataFrame) -> Iterator[dict]:
     """Of one time.  rows: of the trainings that got there."""
     for name in MEASURES:
         known = rows.dropna(subset=[name, SCORE, *CONTROLS])
-        sizes = known["scene"].map(known["scene"].value_counts())
-        known = pd.DataFrame(known[sizes >= LEAST])
+        enough = {scene for scene in {*known["scene"]} if sum(known["scene"] == scene) >= LEAST}
+        known = pd.DataFrame(known[known["scene"].isin([*enough])])
         values = known[[name, SCORE, *CONTROLS]].to_numpy(float)
         scenes, cells = (pd.factorize(known[key])[0] for key in ("scene", "cell"))
         tau, error, clusters = jackknife(values, scenes, cells)

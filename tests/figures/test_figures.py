@@ -264,12 +264,11 @@ def test_contours_of_the_loss_are_solid_also_below_0_and_at_the_ticks_of_the_col
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     axes = next(each for each in figure.axes if each.get_ylabel().startswith("step"))
     loss, model = (each for each in axes.collections if isinstance(each, QuadContourSet) and not each.filled)
-    assert (np.asarray(loss.levels) < 0).any() and [dashes for _, dashes in loss.get_linestyles()] == [None] * len(
-        loss.levels
-    )
-    assert model.get_linestyles()[0][1] is not None
+    dashes = [[dash for _, dash in np.asarray(each.get_linestyle(), dtype=object)] for each in (loss, model)]
+    levels = [*loss.levels]
+    assert min(levels) < 0 and dashes[0] == [None] * len(levels) and dashes[1][0] is not None
     (bar,) = axes.child_axes
-    assert list(bar.get_yticks()) == list(loss.levels)
+    assert list(bar.get_yticks()) == levels
 
 
 @pytest.mark.parametrize(("stretch", "same"), [(1.2, True), (1.6, False)])

@@ -75,7 +75,8 @@ def test_code_written_apart_finds_the_same_numbers():
     def tau(part: pd.DataFrame) -> float:
         r = np.eye(4)
         for i, j in combinations(range(4), 2):
-            r[i, j] = r[j, i] = np.sin(np.pi / 2 * kendalltau(part[columns[i]], part[columns[j]])[0])
+            found: float = kendalltau(part[columns[i]], part[columns[j]])[0]  # pyright: ignore[reportAssignmentType]
+            r[i, j] = r[j, i] = np.sin(np.pi / 2 * found)
         left = np.linalg.solve(r[2:, 2:], r[2:, :2]).T
         over = lambda i, j: r[i, j] - left[i] @ r[2:, j]  # noqa: E731
         return float(2 / np.pi * np.arcsin(over(0, 1) / np.sqrt(over(0, 0) * over(1, 1))))

@@ -149,7 +149,7 @@ def test_the_distance_to_a_swap_is_drawn_from_far_to_near_and_bright():
     assert far.sum() < near.sum() and near == pytest.approx(
         np.asarray(axes.images[0].get_array())[0, 0] / 255, abs=1 / 255
     )
-    assert "to left" in shade.legend and shade.legend.index("10.0<") < shade.legend.index("0.100<")
+    assert "to left" in shade.legend and shade.legend.index("10<") < shade.legend.index("0.10<")
 
 
 def test_the_share_in_one_view_has_the_scale_of_what_its_title_says(folder):

@@ -121,7 +121,7 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     assert skips["gaussians_out_of_sight"].count == data.counts.skipped_gaussians
     for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
         assert f"trace of {label}" in said.out
-    for label in ("largest eigenvalue", "smallest eigenvalue", "eigenvalue ratio", "negative ratio", "checks passed"):
+    for label in ("largest eigenvalue", "smallest eigenvalue", "eigenvalue ratio", "negative ratio", "symmetry"):
         assert label in said.out
     assert "participation ratio" not in said.out and "not necessarily the end" in " ".join(said.out.split())
     assert str(run / "probe-quick" / "report.html") in said.out and "probe.json" in said.out

@@ -161,7 +161,7 @@ def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(train
     for scale in (1.0, 0.5):
         data, _ = synthetic(scale)
         trace, ratio = data["traces"]["means"], bracketed(Index(**data["anisotropy"]["negative_ratio"]))
-        for text in (measured(trace["value"], trace["standard_error"]), ratio.value, "× 2.50", "2.00 … 3.10"):
+        for text in (measured(trace["value"], trace["standard_error"]), ratio.value, "× 2.5", "2.00 … 3.10"):
             assert text in said and text in page
         assert (
             f"by {quantity(0.01 * scale)} (root mean square; {quantity(40 / scale)} dB), and 182 of the halves" in page
