@@ -86,13 +86,14 @@ def answer(line: dict, trainings: int) -> str:
 
 
 def make(rows: pd.DataFrame, out: Path) -> Iterator[Path]:
-    """Write table, figure and caption; gives each file when it is there."""
+    """Write caption, and from ENOUGH trainings on table and figure, none before; gives each file when it is there."""
     found = answers(rows)
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / "answers.csv", found.to_csv(index=False, float_format="%.4g").encode())
     write_atomically(out / "caption.md", f"{caption(rows, found)}\n".encode())
-    yield from (out / "answers.csv", out / "caption.md")
-    if len(found):
+    yield out / "caption.md"
+    if len(found) and sum(rows["at"] == "end") >= ENOUGH:
+        write_atomically(out / "answers.csv", found.to_csv(index=False, float_format="%.4g").encode())
+        yield out / "answers.csv"
         figure = draw_prediction(found)
         yield from (save(figure, out / f"prediction.{suffix}") for suffix in ("png", "pdf"))
 
@@ -185,7 +186,8 @@ def draw_prediction(table: pd.DataFrame) -> Figure:
 def caption(rows: pd.DataFrame, table: pd.DataFrame) -> str:
     """What was measured and what it answers, from the numbers."""
     ended = sum(rows["at"] == "end")
-    words = f"{ended} trainings of {rows['scene'].nunique()} scenes"
+    scenes = len({*rows["scene"]})
+    words = f"{ended} trainings of {scenes} scene{'s' * (scenes != 1)}"
     if ended < ENOUGH:
         return f"{words}; before {ENOUGH} nothing is answered."
     told = [f"{at if at == 'end' else at + ' dB'}: {name_of(name)}" for at, name in zip(table["at"], table["measure"])]

@@ -124,8 +124,8 @@ def test_a_table_a_figure_and_a_caption_are_written(tmp_path):
     said = (tmp_path / "caption.md").read_text()
     assert "576 trainings of 6 scenes" in said and "predicts: end: trace" in said
     few = pd.DataFrame(rows[rows["cell"].isin(CELLS[:3])])
-    [table, caption] = make(few, tmp_path / "few")
-    assert "nothing is answered" in caption.read_text() and table.read_text().count("\n") == 1
+    [caption] = make(few, tmp_path / "few")
+    assert "nothing is answered" in caption.read_text()
 
 
 def test_another_table_is_refused(tmp_path):
