@@ -46,11 +46,10 @@ def draw(record: Record[ProbeRecord]) -> Figure:
         axes = figure.subplots()
         _rows(axes, entries)
         if shares:
+            loss, rendered = record.data.objective.value or 1.0, record.data.step_rises or {}
+            rises = {name: abs(rise) / loss for name, (rise, _) in rendered.items()}
             _draw_traces(axes, {name: scaled(entry, shares[name]) for name, entry in entries.items()},
-                         {name: shares[name] * np.asarray(found) for name, found in samples.items()})  # fmt: skip
-            for name, (rise, _) in (record.data.step_rises or {}).items():
-                axes.plot([abs(rise) / (record.data.objective.value or 1.0)], [list(entries).index(name)], "D", color=ORANGE,
-                          markersize=4, zorder=6)  # fmt: skip
+                         {name: shares[name] * np.asarray(found) for name, found in samples.items()}, rises)  # fmt: skip
             axes.set_xlabel(
                 "change of the loss by one random step as long as the\noptimiser's first (share): by curvature; ◆ rendered"
             )
@@ -83,10 +82,14 @@ def _title(data: ProbeRecord) -> str:
     return f"{text}\n(beside the names: traces, each in its own unit)"
 
 
-def _draw_traces(axes: Axes, entries: dict[str, Trace], samples: dict[str, np.ndarray]) -> None:
-    magnitudes = [abs(e.value) for e in entries.values() if _drawable(e.value)]
+def _draw_traces(
+    axes: Axes, entries: dict[str, Trace], samples: dict[str, np.ndarray], rendered: dict[str, float] | None = None
+) -> None:
+    rendered = rendered or {}
+    magnitudes = [abs(n) for n in (*(e.value for e in entries.values()), *rendered.values()) if _drawable(n)]
     left = _logarithmic(axes, magnitudes)
     for row, (name, entry) in enumerate(entries.items()):
+        axes.plot([rendered.get(name, math.nan)], [row], "D", color=ORANGE, markersize=4, zorder=6)
         look = SIGNS[_sign(entry)]
         drawn = np.abs(samples.get(name, np.empty(0)))
         axes.plot(drawn, np.full(len(drawn), row), "|", color=look["color"], alpha=0.35, markersize=6, zorder=1)

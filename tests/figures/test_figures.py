@@ -21,7 +21,7 @@ from analysis.records.records import read_record
 from analysis.records.run_files import END_MAPS, Steepest
 from figures import make_all, maps, slice2d, spectrum, surface, traces
 from figures.plane import plane
-from figures.style import BLACK, COLUMN, SKY, save, style
+from figures.style import BLACK, COLUMN, ORANGE, SKY, save, style
 from landscape.errors import TooLittleMemory
 from tests.recorded import long_numbers, synthetic, written, written_map
 from tests.refusals import refused
@@ -392,3 +392,18 @@ def test_a_figure_from_the_command_line_and_its_refusal(tmp_path):
 def test_an_axis_takes_out_a_power_of_a_thousand():
     assert [exponent_of(10.0**k) for k in (-12, -4, -1, 0, 3, 4, 9)] == [-12, -6, 0, 0, 0, 3, 9]
     assert exponent_of(np.array([np.nan, 0.0])) == 0
+
+
+def test_rendered_steps_are_drawn_within_the_axes_however_far_from_the_curvature(tmp_path):
+    data, arrays = synthetic()
+    data["steps"] = dict.fromkeys(data["traces"], 1e-3)
+    data["step_rises"] = {name: (10.0 ** (-3 * k), 0.0) for k, name in enumerate(data["traces"])}
+    axes = traces.draw(written(tmp_path / "probe", data, arrays)).axes[0]
+    low, high = axes.get_xlim()
+    drawn = [
+        float(np.ravel(line.get_xdata())[0])
+        for line in axes.lines
+        if line.get_marker() == "D" and line.get_color() == ORANGE
+    ]
+    shown = [rise / data["objective"]["value"] for rise, _ in data["step_rises"].values()]
+    assert drawn == pytest.approx(shown) and low < min(drawn) and max(drawn) < high
