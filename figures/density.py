@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from analysis.records.quantities import exponent_of, percent, power_of_ten, quantity, unit_suffix
+from analysis.records.quantities import exponent_of, extent, percent, power_of_ten, quantity, unit_suffix
 from figures.style import BLUE, VERMILION, new_figure, style
 
 if TYPE_CHECKING:
@@ -97,5 +97,4 @@ def unresolved_share(*spectra: Mapping[str, np.ndarray]) -> str:
     """Words on the share of directions at nodes that `at_zero` moves, over all starts; empty where it moves none."""
     moved = [each["weights"] * (at_zero(each["nodes"]) != each["nodes"]) for each in spectra if "nodes" in each]
     shares = [float(share) for each in moved for share in each.sum(axis=1)]
-    ends = " to ".join(dict.fromkeys(map(percent, (min(shares), max(shares))))) if shares else "0%"
-    return f"not resolved from 0: {ends} of all" if any(shares) else ""
+    return f"not resolved from 0: {extent(shares, percent)} of all" if any(shares) else ""

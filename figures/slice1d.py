@@ -19,12 +19,12 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.console.failures import program
 from analysis.records.findings import resolved
-from analysis.records.quantities import exponent_of, quantity, unit_suffix
+from analysis.records.quantities import exponent_of, extent, quantity, unit_suffix
 from analysis.records.records import Record
 from analysis.records.schema import FiniteProbe, Slice
 from figures.plane import Direction, direction
 from figures.scripts import script
-from figures.slice2d import CROSSED, RENDERED, finding, times
+from figures.slice2d import CROSSED, RENDERED, finding
 from figures.style import BLACK, BLUE, VERMILION, new_figure, style
 from landscape.errors import InputError
 
@@ -107,7 +107,7 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: FiniteProbe) -> None:
     axes.set_xlabel(f"step along {along.name}, {along.scale}")
     axes.set_ylabel("curvature (loss per squared step)")
     axes.grid(True)
-    seen = f"{times(values[sure] / exact)} the curvature" if sure.any() and exact else "hidden by round-off"
+    seen = f"{extent(values[sure] / exact)} times the curvature" if sure.any() and exact else "hidden by round-off"
     axes.set_title(f"At finite steps {seen}\n(bars: round-off)", loc="left")
 
 

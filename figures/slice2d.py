@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, Locator, MaxNLocator
 
 from analysis.console.failures import program
-from analysis.records.quantities import AGREES, quantity, rough
+from analysis.records.quantities import AGREES, extent, quantity, rough
 from analysis.records.records import Record
 from figures.plane import Direction, Plane, plane, same_scale
 from figures.scripts import script
@@ -86,21 +86,12 @@ def finding(direction: Direction, change: np.ndarray, model: np.ndarray | None) 
     away = f"{'falls' if up else 'rises'} on {'both sides' if turned.all() else 'one side'}"
     if held:
         units = rough(float(direction.steps[centre + steps[held - 1]] / direction.unit))
-        rest = away if ratios[-1] < 0 else f"{times(ratios[held:])} as much"
+        rest = away if ratios[-1] < 0 else f"{extent(ratios[held:])} times as much"
         return f"{along} curves as its curvature says to {units} units, then {rest}"
     if ratios.max() < 0:
         return f"{along} {away}, against its curvature"
     way = "" if ratios.min() < 0 else " up" if up else " down"
-    return f"{along} curves{way} {times(ratios)} what its curvature says"
-
-
-def times(ratios: np.ndarray) -> str:
-    """The range of ratios in words.
-
-    >>> times(np.array([1.57, 2.16, 1.12])), times(np.array([2.0]))
-    ('1.1 to 2.2 times', '2.0 times')
-    """
-    return " to ".join(dict.fromkeys(map(rough, (float(ratios.min()), float(ratios.max()))))) + " times"
+    return f"{along} curves{way} {extent(ratios)} times what its curvature says"
 
 
 def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:

@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from analysis.console.failures import program
-from analysis.records.quantities import rough
+from analysis.records.quantities import extent
 from analysis.records.run_files import ENDS, read_trajectory
 from figures.scripts import table_script
 from figures.style import BLACK, RUNS, few_decades, literal, new_figure, style
@@ -95,11 +95,10 @@ def _happened(method: str, runs: list[str], measured: pd.DataFrame) -> str:
     known = [pd.DataFrame(measured[(measured["run"] == run) & (measured["lambda_max"] > 0)]) for run in runs]
     if min(map(len, known)) < 2:
         return literal(f"{method}: one record of λ max")
-    grown = sorted(float(each["lambda_max"].iloc[-1] / each["lambda_max"].iloc[0]) for each in known)
+    grown = extent(float(each["lambda_max"].iloc[-1] / each["lambda_max"].iloc[0]) for each in known)
     some = "one run" if len(runs) == 1 else f"{len(runs)} runs"
-    words = " to ".join(dict.fromkeys((rough(grown[0]), rough(grown[-1]))))
     first, last = known[0]["step"].iloc[0], known[0]["step"].iloc[-1]
-    return textwrap.fill(literal(f"{method}: λ max × {words} from step {first:,} to {last:,} ({some})"), WRAP)
+    return textwrap.fill(literal(f"{method}: λ max × {grown} from step {first:,} to {last:,} ({some})"), WRAP)
 
 
 def step_ticks() -> MaxNLocator:

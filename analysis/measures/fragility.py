@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from analysis.measures.depth import gradient_ratio
-from analysis.records.quantities import measured, percent, quantity
+from analysis.records.quantities import extent, measured, percent, quantity
 from analysis.records.run_files import Fragility, Swaps
 from landscape.results import Progress, finite_or_none
 from splat.curvature.fields import Values
@@ -116,8 +116,8 @@ def fragility_sentences(found: Fragility) -> list[str]:
     shares = [row[at] for row, pairs in zip(moved.share, moved.pairs, strict=True) if pairs]
     position = "Position: no two Gaussians share a pixel."
     if shares:
-        spread = " to ".join(dict.fromkeys((percent(min(shares)), percent(max(shares)))))
-        position = f"Position: 1 px along the ray changes the order of {spread} of the neighbouring pairs of a view"
+        changed = extent(shares, percent)
+        position = f"Position: 1 px along the ray changes the order of {changed} of the neighbouring pairs of a view"
         jump, clear = measured(moved.jump, moved.jump_error), (moved.jump or 0.0) >= 2 * (moved.jump_error or 0.0)
         words = f"; at a swap the loss {'jumps by' if clear else 'has no clear jump:'} {jump}."
         position += words if moved.sampled else "."

@@ -33,6 +33,7 @@ from analysis.records.quantities import AGREES, Shade, percent, quantity, ratio,
 from analysis.records.run_files import Carrier, Steepest
 from analysis.records.schema import Carries
 from landscape import curvature_reach
+from landscape.slices.finite_probe import WITHIN
 from splat.backend.cpu.threads import single_threaded, thread_count
 from splat.curvature.fields import Values, sight_fields
 from splat.curvature.objective import SceneObjective
@@ -200,7 +201,7 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
     if max(abs(each - 1) for each in factors) <= AGREES:
         return f"{text}."
     low, high = quantity(min(factors)), quantity(max(factors))
-    beyond = sum(not 0.5 <= factor <= 2 for factor in factors)
+    beyond = sum(not 1 / WITHIN <= factor <= WITHIN for factor in factors)
     verdict = (
         f"outside of 1/2 to 2 at {beyond} of {len(factors)}, where they refute it" if beyond else "all within 1/2 to 2"
     )

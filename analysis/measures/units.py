@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.probes import draw_probes
 from landscape.results import sampling_error
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
@@ -70,7 +71,7 @@ def step_rises(
         rises = torch.zeros(draws, dtype=torch.float64)
         for i in range(draws):
             step = torch.zeros_like(theta)
-            signs = torch.empty_like(theta[rows]).bernoulli_(generator=generator) * 2 - 1
+            signs = draw_probes(rows.stop - rows.start, 1, generator, theta.dtype, "rademacher")[:, 0]
             step[rows] = steps[rows] * signs
             rises[i] = (objective.loss(theta + step) + objective.loss(theta - step)) / 2 - base
         found[name] = float(rises.mean()), sampling_error(rises, sys.maxsize) or 0.0

@@ -6,6 +6,7 @@ spaces within a number are HARD, so that it is not broken over lines.
 """
 
 import math
+from collections.abc import Callable, Iterable
 from decimal import Decimal
 from typing import Literal
 
@@ -65,6 +66,16 @@ def rough(value: float | None) -> str:
     ['27', '160', '−0.17', '2.5 × 10⁻⁵', '0.0010', '–']
     """
     return UNDETERMINED if value is None else _plain(value, 2) if math.isfinite(value) else quantity(value)
+
+
+def extent(values: Iterable[float], words: Callable[[float], str] = rough) -> str:
+    """The least and the largest number in words, once where they read alike.
+
+    >>> extent([1.57, 2.16, 1.12]), extent([2.0, 2.01])
+    ('1.1 to 2.2', '2.0')
+    """
+    known = sorted(map(float, values))
+    return " to ".join(dict.fromkeys((words(known[0]), words(known[-1]))))
 
 
 def solved(value: float | None, residual: float | None) -> str:

@@ -87,11 +87,12 @@ def answer(line: dict, trainings: int) -> str:
 
 def make(rows: pd.DataFrame, out: Path) -> Iterator[Path]:
     """Write caption, and from ENOUGH trainings on table and figure, none before; gives each file when it is there."""
-    found = answers(rows)
+    enough = sum(rows["at"] == "end") >= ENOUGH
+    found = answers(rows) if enough else pd.DataFrame()
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / "caption.md", f"{caption(rows, found)}\n".encode())
     yield out / "caption.md"
-    if len(found) and sum(rows["at"] == "end") >= ENOUGH:
+    if len(found):
         write_atomically(out / "answers.csv", found.to_csv(index=False, float_format="%.4g").encode())
         yield out / "answers.csv"
         figure = draw_prediction(found)

@@ -160,9 +160,8 @@ def _spread(data: ProbeRecord) -> str:
     """In how many directions half of all curvature lies, and the participation ratio, as far as the density knows them."""
     known, ratio, parts = data.concentration, data.anisotropy.participation_ratio, []
     if known:
-        ends = [rough(end) for end in (known.half.low, known.half.high)]
-        among = ends[0] if ends[0] == ends[1] else " to ".join(ends)
-        among = f"at most {ends[1]}" if (known.half.low or 0.0) < 1 else among
+        low, high = map(rough, (known.half.low, known.half.high))
+        among = f"at most {high}" if (known.half.low or 0.0) < 1 else " to ".join(dict.fromkeys((low, high)))
         parts.append(f"half of all curvature lies in {among} of {data.counts.active_parameters:,} directions")
     if ratio and ratio.value is not None and not is_loose(ratio):
         parts.append(f"participation ratio {rough(ratio.value)}")

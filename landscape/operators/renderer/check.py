@@ -110,7 +110,9 @@ def require_resolved(hessian: RendererHessian, generator: torch.Generator) -> fl
 
 def _relative(hessian: RendererHessian, stated: ProductErrors, length: Tensor) -> float:
     """The error over the length of one product; inf where noise covers all views, 0 where nothing changes."""
-    return float(stated.total / length) if length else inf if hessian.noise else 0.0
+    if length:
+        return float(stated.total / length)
+    return inf if hessian.noise else 0.0
 
 
 def gradient_ratios(hessian: RendererHessian, V: Tensor, factor: float = 1.0) -> list[float | None]:

@@ -265,14 +265,15 @@ class RendererHessian:
     def step(self, index: int, view: LinearView, v: Tensor) -> float:
         """The step h along v; 0 where it does not change the image, or by its noise alone."""
         largest, size, seen = float(v.abs().max()), rms(view.image) or 1.0, False
+        noise = SEEN * self.noise * size
         # at first the largest parameter moves by `change` of its size
         h = self.change * (float(self.point.abs().max()) or 1.0) / largest if largest else 0.0
         for _ in range(TRIALS if largest else 0):
             self.parameters.write(self.point.double() + h * v.double())
             change = rms(self.image(index, view.image) - view.image)
-            seen, told = change > SEEN * self.noise * size, max(change, SEEN * self.noise * size)
+            seen, change = change > noise, max(change, noise)
             # the change grows like h
-            h *= min(max(self.change * size / told, 1 / FACTOR), FACTOR) if told else 0.0
+            h *= min(max(self.change * size / change, 1 / FACTOR), FACTOR) if change else 0.0
         self.parameters.write(self.point)
         return h if seen else 0.0
 
