@@ -6,7 +6,6 @@ protobuf's JSON), and comes back as a float.  A field that is UNSET is left out.
 
 import json
 import math
-import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -20,8 +19,6 @@ from splat.model import untrusted
 
 T = TypeVar("T")
 NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
-STEP = re.compile(r"\.(\w+)|\[(\d+)\]|(\[\.\.\.\])")  # of a path of msgspec, which leaves out the keys of mappings
-MISSING = "Object missing required field `"
 
 
 def read_json(path: Path, kind: type[T], what: str, remedy: str) -> T:
@@ -46,47 +43,17 @@ def with_remedy(remedy: str, read: Callable[[Path], T], path: Path) -> T:
 
 
 def fitted(data: Any, kind: type[T], where: str, remedy: str) -> T:
-    """Plain types as a structure.  InputError, which begins with `where`, says what was expected under which key."""
+    """Plain types as a structure.  InputError, which begins with `where`, says what was expected under which key.
+
+    >>> fitted({"a": {"x": "?"}}, dict[str, dict[str, float]], "numbers", "measure again")
+    Traceback (most recent call last):
+    landscape.errors.InputError: numbers: expected `float`, got `str` - at `$[...][...]`; measure again
+    """
     try:
         return msgspec.convert(data, kind, strict=True)
     except msgspec.ValidationError as error:
-        raise InputError(f"{where}: {_said(data, kind, str(error))}; {remedy}") from None
-
-
-def _said(data: Any, kind: type, message: str) -> str:
-    """msgspec's message with the whole key and the value there.
-
-    >>> _said({"a": {"x": 1.0, "y": "?"}}, dict[str, dict[str, float]], "Expected `float`, got `str` - at `$[...][...]`")
-    'expected `float`, got \\'?\\' as "a.y"'
-    """
-    what, _, path = message.partition(" - at `")
-    keys: list[str] = []
-    value = data
-    for key, index, unknown in STEP.findall(path.removeprefix("key in ")):
-        step = _failing(data, value, kind, message) if unknown else int(index) if index else key
-        keys.append(f"[{step}]" if index else f".{step}")
-        value = value[step]
-    if what.startswith(MISSING):
-        return f'expected the key "{"".join([*keys, "."])[1:]}{what.removeprefix(MISSING)[:-1]}", got none'
-    what = what[:1].lower() + what[1:]
-    if keys and ", got `" in what:
-        shown = msgspec.json.encode(value).decode() if isinstance(value, list | dict) else repr(value)
-        what = f"{what.partition(', got `')[0]}, got {shown if len(shown) < 60 else f'{shown[:57]}...'}"
-    return what + (f' as "{"".join(keys)[1:]}"' if keys else "")
-
-
-def _failing(data: Any, mapping: dict[str, Any], kind: type, message: str) -> str:
-    """The key of a mapping in data whose value msgspec refuses with this message; the others are taken away."""
-    entries = dict(mapping)
-    for key, value in entries.items():
-        mapping.clear()
-        mapping[key] = value
-        try:
-            msgspec.convert(data, kind, strict=True)
-        except msgspec.ValidationError as error:
-            if str(error) == message:
-                return key
-    raise AssertionError(f"no key of {list(entries)} is refused with {message}")
+        said = str(error)
+        raise InputError(f"{where}: {said[:1].lower()}{said[1:]}; {remedy}") from None
 
 
 def plain(value: Any) -> Any:

@@ -33,10 +33,13 @@ def swept(run: Path) -> float:
         ("", "a damaged file (Input data was truncated)"),
         ('{"test":', "a damaged file (Input data was truncated)"),
         ("[1]", "another: expected `object`, got `array`;"),
-        (json.dumps(METRICS | {"train": 3}), 'another: expected `object | null`, got 3 as "train";'),
-        (json.dumps(METRICS | {"test": WORDS}), "another: expected `float | null`, got 'good' as \"test.ssim\";"),
-        (json.dumps({"train": SCORES}), 'another: expected the key "gaussians", got none;'),
-        (json.dumps(METRICS | {"seconds": {"wall": "x"}}), "another: expected `float`, got 'x' as \"seconds.wall\";"),
+        (json.dumps(METRICS | {"train": 3}), "another: expected `object | null`, got `int` - at `$.train`;"),
+        (json.dumps(METRICS | {"test": WORDS}), "another: expected `float | null`, got `str` - at `$.test.ssim`;"),
+        (json.dumps({"train": SCORES}), "another: object missing required field `gaussians`;"),
+        (
+            json.dumps(METRICS | {"seconds": {"wall": "x"}}),
+            "another: expected `float`, got `str` - at `$.seconds.wall`;",
+        ),
     ],
 )
 def test_damaged_scores_are_named_with_what_to_do(tmp_path, text, got):
@@ -58,8 +61,8 @@ def test_scores_that_are_whole_are_read(tmp_path):
     [
         ("", "a damaged file (Input data was truncated)"),
         ("3", "another: expected `object`, got `int`;"),
-        (json.dumps({"foo": 1}), 'another: expected the key "step", got none;'),
-        (json.dumps(SECONDS | {"wall": "long"}), "another: expected `float`, got 'long' as \"wall\";"),
+        (json.dumps({"foo": 1}), "another: object missing required field `step`;"),
+        (json.dumps(SECONDS | {"wall": "long"}), "another: expected `float`, got `str` - at `$.wall`;"),
     ],
 )
 def test_damaged_seconds_are_named_with_what_to_do(tmp_path, text, got):
