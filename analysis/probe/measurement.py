@@ -11,14 +11,12 @@
     slice               the loss over the plane of the first two eigenvectors: rendered where needed, interpolated elsewhere
     density *           stochastic Lanczos quadrature, for sums of |lambda|; the Krylov spaces of its first runs
                         contain the iterates of the paper's power iteration
-    power iteration     with separate products, only with --power
     finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
     depth *             the positions' gradient and curvature along the rays and across them, and finite steps both ways
     block shares        the share of H that lies within the diagonal blocks of Gaussians
 
-* not in a quick probe.  The first two stages call every kernel once, so that no later stage compiles one.  Estimators stop at
-their accuracy or at a limit on products; their results say which.  Time ends them only at a deadline.  Numbers depend on the
-seed alone, also those of stages kept from an earlier run.
+* not in a quick probe.  Estimators stop at their accuracy or at a limit on products; their results say which.  Time ends them
+only at a deadline.  Numbers depend on the seed alone, also those of stages kept from an earlier run.
 """
 
 from collections.abc import Sequence
@@ -53,7 +51,6 @@ from landscape import (
     curvature_reach,
     evaluate_slice,
     extreme_eigenpairs,
-    power_ends,
     spectral_density,
     symmetric_axis,
 )
@@ -77,17 +74,8 @@ from splat.curvature.traces import block_traces, exact_traces
 from splat.model.gaussians import Gaussians
 from splat.render.backend import CPU, backend_of
 
-STAGES = (
-    "traces",
-    "eigenvalues",
-    "slice",
-    "density",
-    "power iteration",
-    "finite probe",
-    "depth",
-    "block shares",
-    "renders",
-)
+# each stage has random numbers of its own; "": those of one that is gone, so that the others keep theirs
+STREAMS = ("traces", "eigenvalues", "slice", "density", "", "finite probe", "depth", "block shares", "renders")
 LEFT_OUT = {  # notes on stages that the settings exclude
     "density": "the spectral density was left out, and the indices that need it",
     "finite probe": "the finite probe was left out",
@@ -125,7 +113,7 @@ def measure(
         operator_check = check_operator(at.operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(at.hessian, spawn(generator), report, settings.checked_views)
     of_checks = at.work()
-    kept = Kept(stages, generator, STAGES, at.work, folder, identity, deadline)
+    kept = Kept(stages, generator, STREAMS, at.work, folder, identity, deadline)
     return _all_stages(at, steps, kept, operator_check, gradient_check, of_checks, population)
 
 
@@ -157,17 +145,8 @@ def _linearised(objective: SceneObjective, settings: ProbeSettings, ranks: Ranks
     gradient = objective.gradient
     report(1, 1, views)
     value = objective.loss(objective.active.flat)
-    objective.approximate_blocks  # noqa: B018 (cached; its kernels compile in this stage)
-    if settings.block_ssim_window or not settings.trace_samples:
-        _compile_blocks(objective)
+    objective.approximate_blocks  # noqa: B018 (cached, for the stages)
     return _Point(objective, hessian, CountingOperator(operator), settings, gradient, value, ranks)
-
-
-def _compile_blocks(objective: SceneObjective) -> None:
-    """Compile the kernel of exact blocks, on one Gaussian, so that the stages that use it are not timed with that."""
-    if objective.couples_pixels and backend_of(objective.active.flat).exact_blocks:
-        one = objective.active.select(torch.zeros(1, dtype=torch.int64))
-        objective.linearizer(one)(0).block_diagonals(approximate=False, parts=(False, True))
 
 
 def _all_stages(
@@ -187,11 +166,9 @@ def _all_stages(
     ends = search.ends
     rendered = kept.run("renders", Rendered, partial(_rendered, at, ends, steps))
     plane = kept.run("slice", PlaneSlice | None, partial(_plane, at, ends))  # pyright: ignore[reportArgumentType]
-    spectrum = power = finite = depth = None
+    spectrum = finite = depth = None
     if settings.density_matvecs:
         spectrum = kept.run("density", Spectrum, partial(_spectrum, at, ends, traces))
-    if settings.power_apart:
-        power = kept.run("power iteration", EigenEnds, partial(_power, at))
     if settings.probe_steps:
         finite = kept.run("finite probe", FiniteProbe, partial(_finite, at, ends))
     if settings.depth is not None:
@@ -208,7 +185,7 @@ def _all_stages(
         traces=traces,
         ends=ends,
         spreads=search.spreads,
-        power=power or (spectrum and spectrum.power),
+        power=spectrum and spectrum.power,
         density=spectrum and spectrum.density,
         finite=finite,
         depth=depth,
@@ -302,10 +279,6 @@ def _spectrum(
         active=active, ends=ends, trace=total_trace(traces), watch=watch,
     )  # fmt: skip
     return Spectrum(density, iterates[0] if iterates else None)
-
-
-def _power(at: _Point, generator: torch.Generator, report: Progress, _: list[str]) -> EigenEnds:
-    return power_ends(at.operator, generator, at.settings.power, report)
 
 
 def _finite(at: _Point, ends: EigenEnds, _: torch.Generator, report: Progress, __: list[str]) -> FiniteProbe:

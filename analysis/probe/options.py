@@ -33,8 +33,6 @@ class ProbeOptions:
     seconds: float | None = None
     """Time for all, pictures too; the same command continues.
     Default: no limit.  Not under torchrun."""
-    power: bool = False
-    """Power iteration, the paper's way, by 40 products of its own for each end, not from the density's."""
     density_products: int | None = None
     """Of the spectral density; more narrow the brackets of sums.  Default: 108."""
     end_products: int | None = None

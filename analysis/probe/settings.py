@@ -19,8 +19,8 @@ class ProbeSettings:
 
     checked_vectors, checked_views: of the self-checks.
     trace_samples: exactly so many for each trace; None: as many as `traces` asks for.
-    power: iterates of power iteration; power_apart: with products of its own.  density_matvecs: products of the spectral
-        density (a tenth of them see the ends again); 0: it is left out.
+    power: iterates of power iteration, read from the density.  density_matvecs: products of the spectral density (a tenth of
+        them see the ends again); 0: it is left out.
     slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
         of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
         slice_plane: whether to render more than its two axes.
@@ -37,7 +37,6 @@ class ProbeSettings:
     trace_samples: int | None = None
     eigen: EigenSettings = field(default_factory=lambda: EigenSettings(2, 1, max_matvecs=3000, further=TEN - 1))
     power: PowerSettings = field(default_factory=lambda: PowerSettings(max_matvecs=40))
-    power_apart: bool = False
     density_matvecs: int = 108
     slice_points: int = 41
     slice_radius: float = 3.0

@@ -68,7 +68,6 @@ from splat.training.state import Training
 
 START = "start"
 Row = dict[str, Any]
-FEWEST_OF_DENSITY = 16  # products
 COARSE_MATVECS = 24  # products of a coarse record's search for the ends
 COLUMNS = (*MEASURED, *(f"of_{part}" for part in ("data", "question", "state", "formulas")))
 
@@ -115,7 +114,6 @@ class Trajectory:
     ) -> None:
         self.run, self.training, self.views, self.settings, self.reference = run, training, views, settings, reference
         self.rows = _read_rows(run / RECORDS, training.step)
-        _compile(training, views, settings)
 
     def before_steps(self) -> None:
         """Record the start."""
@@ -223,11 +221,3 @@ def _read_rows(path: Path, step: int) -> list[Row]:
     rows: list[Row] = [dict(zip(text, row, strict=True)) for row in text.itertuples(index=False)]
     kept = zip(rows, table["step"], table["seconds"], strict=True)
     return [row | {"seconds": float(seconds)} for row, at, seconds in kept if at <= step]
-
-
-def _compile(training: Training, views: Sequence[View], settings: TrajectorySettings) -> None:
-    """Compile a record's kernels, on a few Gaussians, outside its measured time."""
-    seen = training.config.objective(training.gaussians, views).mask.nonzero()[:8, 0]
-    few = training.config.objective(training.gaussians.select(seen), views)
-    least = replace(settings, eigen=EigenSettings(max_matvecs=10), density_matvecs=FEWEST_OF_DENSITY)
-    measure(few, torch.Generator(training.gaussians.flat.device).manual_seed(0), least)
