@@ -2,13 +2,12 @@
 
 mass           of Gaussian i in a vector v: m_i = sum of v^2 over its parameters; shares are of sum_i m_i = |v|^2
 participation  (sum_i m_i)^2 / sum_i m_i^2: over how many Gaussians the mass is spread, 1 to n
-condition      kappa of a splat's 2-D covariance Sigma' = r r^T + blur 1, lambda_max / lambda_min: the largest
-               over the views on whose image its 3-sigma box lies; `rendered` with the blur, `bare` without
+condition      kappa of a splat's 2-D covariance, blur and all, lambda_max / lambda_min: the largest over the views on whose
+               image its 3-sigma box lies
 needle         a Gaussian with kappa > 100
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Float64
@@ -21,14 +20,6 @@ from splat.model.settings import RenderSettings
 from splat.projection.reference import NEEDLE, condition, on_screen, project
 
 HEAVIEST = 10  # Gaussians that are listed
-
-
-@dataclass(frozen=True, eq=False)
-class Conditions:
-    """The largest condition number of each Gaussian's splats; 1 where no view shows it."""
-
-    rendered: Float64[Tensor, " n"]
-    bare: Float64[Tensor, " n"]
 
 
 def mass_shares(vector: Float[Tensor, " p"], blocks: Mapping[str, slice]) -> dict[str, float]:
@@ -64,32 +55,28 @@ def participation(mass: Float[Tensor, " n"]) -> float:
 @torch.no_grad()
 def conditions(
     gaussians: Gaussians, cameras: Sequence[Camera], settings: RenderSettings = RenderSettings()
-) -> Conditions:
-    """The condition numbers of every Gaussian's splats, in double precision."""
+) -> Float64[Tensor, " n"]:
+    """The largest condition number of each Gaussian's splats, in double precision; 1 where no view shows it."""
     gaussians = gaussians.to(torch.float64)
-    unblurred = replace(settings, blur=0.0)
-    rendered, bare = (gaussians.flat.new_ones(len(gaussians)) for _ in range(2))
+    worst = gaussians.flat.new_ones(len(gaussians))
     for camera in cameras:
-        shown = on_screen(project(gaussians, camera, settings), camera)
-        for worst, how in ((rendered, settings), (bare, unblurred)):
-            worst[shown] = torch.maximum(worst, condition(project(gaussians, camera, how).conics))[shown]
-    return Conditions(rendered, bare)
+        splats = project(gaussians, camera, settings)
+        shown = on_screen(splats, camera)
+        worst[shown] = torch.maximum(worst, condition(splats.conics))[shown]
+    return worst
 
 
-def localize(vector: Float[Tensor, " p"], gaussians: Gaussians, conditions: Conditions) -> LivesOn:
+def localize(vector: Float[Tensor, " p"], gaussians: Gaussians, conditions: Float64[Tensor, " n"]) -> LivesOn:
     """Localization of a vector laid out like `gaussians.flat`; conditions: of the same Gaussians."""
     mass = masses(vector, gaussians)
-    if len(conditions.rendered) != len(gaussians):
-        raise ValueError(f"expected conditions of {len(gaussians)} Gaussians, got {len(conditions.rendered)}")
-    share = mass / mass.sum()
-    needles, bare = conditions.rendered > NEEDLE, conditions.bare > NEEDLE
+    if len(conditions) != len(gaussians):
+        raise ValueError(f"expected conditions of {len(gaussians)} Gaussians, got {len(conditions)}")
+    share, needles = mass / mass.sum(), conditions > NEEDLE
     top = share.topk(min(HEAVIEST, len(share)))
     return LivesOn(
         attributes=mass_shares(vector, gaussians.blocks),
         participation=participation(mass),
         needles=float(share[needles].sum()),
-        needles_bare=float(share[bare].sum()),
         needle_count=int(needles.sum()),
-        needle_bare_count=int(bare.sum()),
         heaviest=list(zip(top.indices.tolist(), top.values.tolist(), strict=True)),
     )

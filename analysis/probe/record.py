@@ -5,9 +5,7 @@ from dataclasses import replace
 from math import isfinite, nan
 
 import numpy as np
-from jaxtyping import Float64
-from msgspec import UNSET, UnsetType, convert, structs
-from torch import Tensor
+from msgspec import UNSET, convert, structs
 
 from analysis.measures.gradient_check import ENOUGH
 from analysis.measures.localization import conditions, localize, mass_shares
@@ -151,7 +149,6 @@ def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalu
         for end, curvatures in zip((rows.max, rows.second, rows.min), found.left_out.curvatures.T, strict=True):
             if end:
                 end.views_error = sampling_error(curvatures, found.left_out.population)
-                end.without_one = without_one(curvatures)
     return rows
 
 
@@ -169,15 +166,6 @@ def renders_record(probe: FiniteProbe, step: float = 0.0, kinks: float = 0.0) ->
         | {"confirmed": confirmed, "low": low, "high": high, "optimiser_step": step, "kinks": kinks},
         schema.Renders,
     )
-
-
-def without_one(curvatures: Float64[Tensor, " m"]) -> tuple[float, float] | UnsetType:
-    """The least and the largest mean without one of the values; UNSET of a single value."""
-    m = len(curvatures)
-    if m < 2:
-        return UNSET
-    means = (curvatures.sum() - curvatures) / (m - 1)
-    return float(means.min()), float(means.max())
 
 
 def anisotropy_record(

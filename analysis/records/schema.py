@@ -127,17 +127,15 @@ class Trace(TraceOf, kw_only=True):
 class LivesOn(Struct, kw_only=True):
     """Localization of an eigenvector (`analysis.measures.localization`).
 
-    attributes: shares of the squared mass |v|^2.  participation: over how many Gaussians it is spread.  needles, needles_bare:
-    share of it on Gaussians with a condition number above 100, with and without the blur of 0.3 px^2; needle_count,
-    needle_bare_count: the number of those.  heaviest: (number among all, share) of Gaussians, the largest share first.
+    attributes: shares of the squared mass |v|^2.  participation: over how many Gaussians it is spread.  needles: share of it on
+    Gaussians with a condition number above 100; needle_count: the number of those.  heaviest: (number among all, share) of
+    Gaussians, the largest share first.
     """
 
     attributes: dict[str, Portion] = {}
     participation: Number
     needles: Portion
-    needles_bare: Portion | None = None
     needle_count: Count
-    needle_bare_count: Count = 0
     heaviest: list[tuple[Count, Portion]] = []
 
 
@@ -147,7 +145,6 @@ class End(Struct, kw_only=True):
     residual: |H v - value v|: an eigenvalue lies within this distance.  vector_error: about the sine of the angle between v and
     the true eigenvector.  reason, note: as for `TraceOf`.  views_error: likewise, of v . H v at this v; in the views left out
     another direction may be steeper; the largest eigenvalue of few views is usually too large, as it is convex in H.
-    without_one: least and largest v . H v with one of the views measured left out.
     """
 
     value: Number
@@ -156,7 +153,6 @@ class End(Struct, kw_only=True):
     reason: str | None = None
     note: Maybe[str] = UNSET
     views_error: Maybe[Number] = UNSET
-    without_one: Maybe[tuple[float, float]] = UNSET
 
     def __post_init__(self) -> None:
         require_order(zero=0.0, residual=self.residual)
