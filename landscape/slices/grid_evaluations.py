@@ -1,13 +1,13 @@
 """Evaluations of an objective at points of a slice's grid: in parallel, and kept in a store so that a run can continue.
 
-The store holds a SHA-256 digest of (center, directions, coordinates) and the loss at the centre.  When it is read, the loss at
-the centre and the value that differs most from it are evaluated again and compared.  Values of another slice or of another
-objective are refused with an InputError.
+The store holds a SHA-256 digest of (center, directions, coordinates) and the loss at the centre.  What it holds of another
+slice, of an objective with another loss at the centre, or damaged, is evaluated again.
 """
 
 import hashlib
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from math import isfinite
 from time import monotonic
 from typing import Protocol
@@ -28,7 +28,7 @@ Loss = Callable[[Tensor], Evaluation]
 class Store(Protocol):
     """Where evaluations are kept: writes all of the arrays or none, and reads them again, none before any were written.
 
-    Its text names it in messages.  Reading raises InputError where they are damaged.
+    Reading raises InputError where they are damaged.
     """
 
     def read(self) -> Mapping[str, np.ndarray]: ...
@@ -37,7 +37,6 @@ class Store(Protocol):
 
 
 SAVE_EVERY = 5.0  # seconds
-COLUMNS = {"points": "i", "values": "f", "crossed": "b"}  # of the file, with the kinds of their types
 SAME_LOSS = 100.0  # units of round-off by which two evaluations at one point may differ, summed in different orders
 
 
@@ -75,7 +74,7 @@ class GridEvaluations:
         self.has_pieces = self._here is not None
         self.value = np.full(len(points), np.nan)
         self.known, self.discontinuous = np.zeros((2, len(points)), bool)
-        self._digest = slice_digest(self._center, self._spans, points)
+        self._digest = f"{slice_digest(self._center, self._spans, points)} {self.has_pieces}"
         self._stored = self._read(store) if store is not None else {}
 
     def require(self, points: Iterable[int]) -> None:
@@ -117,59 +116,22 @@ class GridEvaluations:
             self._progress(int(self.known.sum()), len(self.known), "slice")
 
     def _write(self, store: Store) -> None:
-        values, crossed = zip(*self._stored.values(), strict=True) if self._stored else ((), ())
+        rows = [(point, *found) for point, found in self._stored.items()]
         store.write(
             digest=np.array(self._digest),
             center_loss=np.array(self.center_loss),
-            has_signature=np.array(self.has_pieces),
-            points=np.array(list(self._stored), dtype=np.int64),
-            values=np.array(values, dtype=np.float64),
-            crossed=np.array(crossed, dtype=bool),
+            evaluations=np.array(rows, dtype=np.float64).reshape(-1, 3),
         )
 
     def _read(self, store: Store) -> dict[int, tuple[float, bool]]:
-        advice = "name another file or delete this one"
-        try:
-            archive = store.read()
-        except InputError as error:
-            raise InputError(f"{error}; {advice}") from None
-        if not archive:
-            return {}
-        try:
-            if missing := {"digest", "center_loss", "has_signature", *COLUMNS} - archive.keys():
-                raise ValueError(f"no {', '.join(sorted(missing))}")
-            digest, center_loss = str(archive["digest"]), float(archive["center_loss"])
-            has_pieces = bool(archive["has_signature"])
-            columns = [archive[name] for name in COLUMNS]
-            if any((each.dtype.kind, each.ndim) != (kind, 1) for each, kind in zip(columns, COLUMNS.values())):
-                raise ValueError(
-                    f"expected one-dimensional {', '.join(COLUMNS)} of kinds {', '.join(COLUMNS.values())}"
-                )
-            points, values, crossed = (each.tolist() for each in columns)
-            stored = dict(zip(points, zip(values, crossed, strict=True), strict=True))
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"expected a slice's evaluations in {store}, got a damaged file ({error}); {advice}"
-            ) from None
-        if digest != self._digest:
-            raise InputError(
-                f"expected evaluations of this slice in {self._store}, got another center, other directions or "
-                f"coordinates; {advice}"
-            )
-        self._require_same("at the centre", self.center_loss, center_loss, has_pieces == self.has_pieces, advice)
-        finite = {point: value for point, (value, _) in stored.items() if isfinite(value)}
-        if finite:
-            point = max(finite, key=lambda point: abs(finite[point] - center_loss))
-            self._require_same(f"at point {point}", self._at(point)[0], finite[point], True, advice)
-        return stored
-
-    def _require_same(self, where: str, here: float, stored: float, alike: bool, advice: str) -> None:
-        room = SAME_LOSS * torch.finfo(self._center.dtype).eps * max(abs(here), abs(self.center_loss))
-        if not (alike and abs(here - stored) <= room):
-            raise InputError(
-                f"expected evaluations of this objective in {self._store}, which is {here} {where}, got one that is {stored}; "
-                f"{advice}"
-            )
+        """The evaluations in a store; none where they are damaged, or of another slice or objective."""
+        with suppress(KeyError, TypeError, ValueError, OverflowError):
+            kept = store.read()
+            room = SAME_LOSS * torch.finfo(self._center.dtype).eps * abs(self.center_loss)
+            if kept and str(kept["digest"]) == self._digest and abs(kept["center_loss"] - self.center_loss) <= room:
+                rows = kept["evaluations"].astype(np.float64).reshape(-1, 3).tolist()
+                return {int(point): (value, bool(crossed)) for point, value, crossed in rows}
+        return {}
 
 
 def slice_digest(center: Tensor, directions: Tensor, points: Tensor) -> str:

@@ -76,7 +76,7 @@ def evaluate_slice(
     the quadratic model, or neither; the model takes d matvecs, or none if the operator is given as the matrix E^T H E.
     settings: for a plane; every point of a line is evaluated.  generator: draws the hold-out points (`refinement`) of a plane;
     may be None only if settings.tolerance is.  store: keeps evaluations, from which an interrupted run continues.
-    Raises InputError if the objective at the centre is not finite, or store holds another slice.
+    Raises InputError if the objective at the centre is not finite.
 
     >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
     >>> bowl = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :2], [axis, axis], generator=generator)

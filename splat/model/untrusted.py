@@ -422,9 +422,6 @@ class KeptArrays:
         np.savez(content, **arrays)  # pyright: ignore[reportArgumentType]
         write_atomically(self.path, content.getvalue())
 
-    def __str__(self) -> str:
-        return str(self.path)
-
 
 def beside(folder: Path) -> Path:
     """Where the lock of a folder lies, which may not exist yet."""

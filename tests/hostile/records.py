@@ -294,6 +294,6 @@ RECORDS = {
         lambda root: _use_stages(root, Random(0)), _use_stages, "*.msgpack", "*.msgpack", refuses=False
     ),
     "evaluations of a slice": Reader(
-        lambda root: _use_points(root, Random(0)), _use_points, "points.npz", "points.npz"
+        lambda root: _use_points(root, Random(0)), _use_points, "points.npz", "points.npz", refuses=False
     ),
 }
