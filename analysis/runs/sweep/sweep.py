@@ -38,7 +38,7 @@ from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS, read_scores
 from analysis.runs.options import SweepOptions
 from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
-from analysis.runs.sweep.sweep_results import PROBE, of_other_threads, summarize, tables, unfinished, write_results
+from analysis.runs.sweep.sweep_results import PROBE, summarize, tables, unfinished, write_results
 from analysis.train.command import planned, resumed
 from analysis.train.training_time import TrainingTime
 from landscape.errors import InputError
@@ -271,7 +271,7 @@ def _conclude(cells: _Cells, stopped: int) -> int:
     rows = cells.write()
     for table in tables(summarize(rows)):
         console.print(table)
-    say(*unfinished(rows), *of_other_threads(rows), style="yellow", console=console)
+    say(*unfinished(rows), style="yellow", console=console)
     say(*cells.failed.values(), style="red", console=console)
     say(*(f"{name}: another sweep is at it" for name in elsewhere), style="yellow", console=console)
     done = sum(not cells.to_do[cell.name] for cell in sweep.cells)

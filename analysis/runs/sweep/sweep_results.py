@@ -2,12 +2,12 @@
 
 OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or "to do"); once it is trained: psnr (dB),
                   ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads (that
-                  its steps might use; none where a resume changed them), peak_memory (bytes of the process); wall_ratio,
-                  cpu_ratio: over the seconds of the first method, of the same scene and seed, the wall's only at the same
-                  number of threads; where it was probed, trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error
-                  (standard error or residual), of the latter also the _reason why the search ended ("... budget": the end
-                  may lie farther out), and the anisotropy indices with _low and _high, without value where one of these is
-                  unbounded; with the split control, split_INDEX: its factor on the index
+                  its steps might use; none where a resume changed them), peak_memory (bytes of the process), cpu_ratio
+                  (of cpu_seconds to those of the first method, of the same scene and seed); where it was probed,
+                  trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error (standard error or residual), of the latter
+                  also the _reason why the search ended ("... budget": the end may lie farther out), and the anisotropy
+                  indices with _low and _high, without value where one of these is unbounded; with the split control,
+                  split_INDEX: its factor on the index
 OUT/summary.csv   scene, method, and of every number its _mean, its sample standard deviation _std and the count _n
 """
 
@@ -30,8 +30,8 @@ from analysis.runs.sweep.sweep_file import Cell, Sweep
 from splat.training.checkpoint import write_atomically
 
 RESULTS, SUMMARY, PROBE = "results.csv", "summary.csv", "probe"
-TRAINING = SCORES | {"gaussians": "Gaussians", "wall_ratio": "time ×", "cpu_ratio": "CPU time ×"}
-DECIMALS = PLACES | {"gaussians": 0, "wall_ratio": 2, "cpu_ratio": 2}
+TRAINING = SCORES | {"gaussians": "Gaussians", "cpu_ratio": "CPU time ×"}
+DECIMALS = PLACES | {"gaussians": 0, "cpu_ratio": 2}
 SPLIT = "split_"
 REASONS = {"lambda_max_reason": "max", "lambda_min_reason": "min"}
 ACROSS = 3  # quantities in a table, each with its deviation: as many as 80 columns hold beside scene and method
@@ -57,21 +57,16 @@ def results(cells: Sequence[Cell], statuses: Mapping[str, str]) -> pd.DataFrame:
 
 
 def with_ratios(rows: pd.DataFrame) -> pd.DataFrame:
-    """Seconds over those of the first method, of the same scene and seed; those by the clock only at as many threads.
+    """The rows with `cpu_ratio`.
 
-    >>> both = {"scene": "fern", "method": ["3dgs", "sam"], "seed": 0, "wall_seconds": [10.0, 21.0], "cpu_seconds": [9.0, 18.0]}
-    >>> with_ratios(pd.DataFrame(both | {"threads": 2}))[["wall_ratio", "cpu_ratio"]].values.tolist()
-    [[1.0, 1.0], [2.1, 2.0]]
+    >>> rows = pd.DataFrame({"scene": "fern", "method": ["3dgs", "sam"], "seed": 0, "cpu_seconds": [9.0, 18.0]})
+    >>> with_ratios(rows)["cpu_ratio"].tolist()
+    [1.0, 2.0]
     """
-    if "wall_seconds" not in rows:
-        return rows
-    first = rows[rows["method"] == rows["method"].iloc[0]].set_index(["scene", "seed"])
-    keys = pd.MultiIndex.from_arrays([rows["scene"], rows["seed"]])
-    for clock in ("wall", "cpu"):
-        reference = first[f"{clock}_seconds"].reindex(keys).to_numpy()
-        rows[f"{clock}_ratio"] = rows[f"{clock}_seconds"] / reference
-    same = rows["threads"] == first["threads"].reindex(keys).to_numpy()
-    rows["wall_ratio"] = rows["wall_ratio"].where(same)
+    if "cpu_seconds" in rows:
+        first = rows[rows["method"] == rows["method"].iloc[0]].set_index(["scene", "seed"])["cpu_seconds"]
+        keys = pd.MultiIndex.from_arrays([rows["scene"], rows["seed"]])
+        rows["cpu_ratio"] = rows["cpu_seconds"] / first.reindex(keys).to_numpy()
     return rows
 
 
@@ -140,16 +135,6 @@ def unfinished(rows: pd.DataFrame) -> list[str]:
         for line in of_budgets({end: row[name] for name, end in REASONS.items()}):
             cells.setdefault(line.text, []).append(f"{row['scene']}/{row['method']}/{row['seed']}")
     return [f"{', '.join(names)}: {text}" for text, names in cells.items()]
-
-
-def of_other_threads(rows: pd.DataFrame) -> list[str]:
-    """Line on the cells whose times by the clock are not compared, if there are any."""
-    found = rows.reindex(columns=["scene", "method", "seed", "wall_ratio", "cpu_ratio"]).dropna(subset="cpu_ratio")
-    cells = found.to_dict("records")
-    names = [f"{c['scene']}/{c['method']}/{c['seed']}" for c in cells if math.isnan(c["wall_ratio"])]
-    if not names:
-        return []
-    return [f"{', '.join(names)}: not trained with as many threads as the first method; their time × is left out"]
 
 
 def tables(summary: pd.DataFrame) -> list[Table]:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -12,15 +13,7 @@ from rich.console import Console
 
 from analysis.records.quantities import PLUS_MINUS
 from analysis.runs.sweep.sweep_file import Cell
-from analysis.runs.sweep.sweep_results import (
-    REASONS,
-    of_other_threads,
-    results,
-    summarize,
-    tables,
-    unfinished,
-    with_ratios,
-)
+from analysis.runs.sweep.sweep_results import REASONS, results, summarize, tables, unfinished, with_ratios
 from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from splat.training.loop import StepResult
@@ -77,14 +70,11 @@ def test_mean_deviation_and_ratio_are_taken_over_the_seeds_of_a_method():
     assert [list(column.cells) for column in table.columns][3] == [f"11.50{PLUS_MINUS}2.12", "20.00", "7.00"]
 
 
-def test_times_by_the_clock_are_compared_only_at_as_many_threads():
-    columns = {"scene": "a", "method": ["x", "y", "z"] * 2, "seed": [0, 0, 0, 1, 1, 1]}
-    columns |= {"wall_seconds": [10.0, 30.0, 30.0] * 2, "cpu_seconds": [9.0, 18.0, 27.0] * 2}
-    rows = with_ratios(pd.DataFrame({**columns, "threads": [2.0, 2.0, 1.0, None, 2.0, None]}))
-    assert rows["wall_ratio"].dropna().tolist() == [1.0, 3.0] and rows["cpu_ratio"].tolist() == [1.0, 2.0, 3.0] * 2
-    (line,) = of_other_threads(rows)
-    assert line.startswith("a/z/0, a/x/1, a/y/1, a/z/1: not trained with as many threads")
-    assert of_other_threads(rows.head(2)) == of_other_threads(rows.drop(columns=["wall_ratio", "cpu_ratio"])) == []
+def test_processor_times_are_compared_with_the_first_method_of_the_same_seed():
+    rows = pd.DataFrame({"scene": "a", "method": ["x", "y", "z"] * 2, "seed": [0, 0, 0, 1, 1, 1]})
+    rows = with_ratios(rows.assign(cpu_seconds=[9.0, 18.0, 27.0, 4.0, 2.0, math.nan]))
+    assert rows["cpu_ratio"].tolist()[:5] == [1.0, 2.0, 3.0, 1.0, 0.5] and math.isnan(rows["cpu_ratio"].iloc[5])
+    assert "cpu_ratio" not in with_ratios(rows.filter(["scene", "method", "seed"]))
 
 
 def test_a_training_continued_with_other_threads_has_none_of_its_own(monkeypatch):
@@ -105,8 +95,8 @@ def test_peak_memory_is_kept_and_never_falls(tmp_path):
 
 
 def test_no_cell_of_the_tables_is_wrapped_or_cut_in_80_columns():
-    names = ["psnr", "ssim", "lpips", "gaussians", "wall_ratio", "cpu_ratio", "trace_means", "trace_sh", "lambda_max"]
-    sizes = {"psnr": 20.0, "ssim": 0.6, "lpips": 0.3, "wall_ratio": 3.4, "cpu_ratio": 3.4}
+    names = ["psnr", "ssim", "lpips", "gaussians", "cpu_ratio", "trace_means", "trace_sh", "lambda_max"]
+    sizes = {"psnr": 20.0, "ssim": 0.6, "lpips": 0.3, "cpu_ratio": 3.4}
     parts = (("mean", 1.0), ("std", 0.7), ("n", 3))
     row = {
         f"{name}_{what}": value * (1 if what == "n" else sizes.get(name, 45000.0))
