@@ -3,10 +3,9 @@
 import os
 import shlex
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from io import BytesIO
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 import torch
@@ -24,12 +23,9 @@ from splat.model.files.tensor_files import gsplat_bytes
 from splat.model.settings import RenderSettings
 from splat.projection.antialias import baked
 from splat.render.render import render_depth
-from splat.scenes.scene import Scene
-from splat.scenes.splits import split_scene
 from splat.training.checkpoint import load_checkpoint, open_subject, save_checkpoint, write_atomically
 from splat.training.origin.frames import shift_in_words, shift_of
 from splat.training.origin.presets import PRESETS, render_of
-from splat.training.origin.scene_reference import SceneReference
 from splat.training.origin.subject import Checkpoint
 
 OURS = ("splat-landscape", "splat-landscape-mip")
@@ -128,21 +124,11 @@ def _to_depths(options: ConvertOptions) -> list[str]:
             path = options.out / PurePosixPath(view.name).with_suffix(".npy")
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, content.getvalue())
-    again = arguments("train", _with_depths(checkpoint.scene, scene, options.out))
-    return [f"depth of {len(views)} views: {shlex.join(['landscape', *again])}", *checkpoint.assumptions]
-
-
-def _with_depths(reference: SceneReference, scene: Scene, depths: Path) -> TrainOptions:
-    """Options of a training on the same views, with these depth maps beside which their list is written where it has to be."""
-    options = TrainOptions(scene.root, images=reference.images, downscale=reference.downscale, method="fsgs")
-    options = replace(options, depths=depths, set=("depths=depth",))
-    for views in (len(reference.train), "all"):
-        with suppress(InputError):  # there may be more of them than a protocol has
-            if [*split_scene(scene, None if views == "all" else views).train] == reference.train:
-                return replace(options, views=views)
-    listed = depths / "train.txt"
-    write_atomically(listed, "".join(f"{name}\n" for name in reference.train).encode())
-    return replace(options, train_list=listed)
+    again = TrainOptions(
+        scene.root, images=checkpoint.scene.images, downscale=checkpoint.scene.downscale, method="fsgs"
+    )
+    words = arguments("train", replace(again, depths=options.out, set=("depths=depth",)))
+    return [f"depth of {len(views)} views: {shlex.join(['landscape', *words])}", *checkpoint.assumptions]
 
 
 def _foreign(options: ConvertOptions) -> tuple[SplatFile, Seen | None]:
