@@ -86,13 +86,6 @@ class Counts(Struct, kw_only=True):
     products: Count = 0
     renders: Count = 0
 
-    def __post_init__(self) -> None:
-        schema.require_order(visible_gaussians=self.visible_gaussians, gaussians=self.gaussians)
-        schema.require_order(active_parameters=self.active_parameters, parameters=self.parameters)
-        schema.require_order(rank=self.rank, active_parameters=self.active_parameters)
-        schema.require_order(views=self.views, views_of=self.views_of)
-        schema.require_order(sh_degree_active=self.sh_degree_active, sh_degree_stored=self.sh_degree_stored)
-
 
 class Check(Struct, kw_only=True):
     """A self-check: value must not exceed bound.  passed: None where the check could not run (see note)."""

@@ -12,7 +12,6 @@ Keys of a file that are not fields are ignored; a file of another version of its
 
 import math
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Annotated, Generic, Literal, TypeVar
 
 from msgspec import UNSET, Meta, Struct, UnsetType
@@ -24,18 +23,9 @@ Count = Annotated[int, Meta(ge=0)]
 Sign = Literal["positive", "negative", "zero", "undetermined"]
 Operator = Literal["hessian", "gauss-newton"]
 IndexName = Literal["eigenvalue_ratio", "negative_ratio", "top_mass", "participation_ratio"]
-ROUND_OFF = 1e-6  # by which numbers may leave their order or [0, 1]
+ROUND_OFF = 1e-6  # by which shares may leave [0, 1]
 NonNegative = Annotated[float, Meta(ge=0)]
 Portion = Annotated[float, Meta(ge=-ROUND_OFF, le=1 + ROUND_OFF)]
-
-
-def require_order(**values: "Number | Maybe[Number]") -> None:
-    """ValueError unless those that are known, and numbers, do not fall, but for round-off."""
-    known = [(name, value) for name, value in values.items() if isinstance(value, float | int) and value == value]
-    for (name, value), (other, next_value) in pairwise(known):
-        size = max(abs(value), abs(next_value))
-        if value > next_value + (ROUND_OFF * size if math.isfinite(size) else 0.0):
-            raise ValueError(f"Expected `{name}` of at most `{other}`, {next_value}, got {value}")
 
 
 class Named(Struct, Generic[T]):
@@ -58,12 +48,8 @@ class Objective(Struct, kw_only=True):
     background: tuple[float, float, float] | None = None
     operator: Operator | None = None
     value: Number = None
-    gradient_norm: Number = None
+    gradient_norm: NonNegative | None = None
     views_error: Maybe[Number] = UNSET
-
-    def __post_init__(self) -> None:
-        require_order(zero=0.0, value=self.value)
-        require_order(zero=0.0, gradient_norm=self.gradient_norm)
 
 
 class TraceOf(Struct, kw_only=True):
@@ -78,7 +64,7 @@ class TraceOf(Struct, kw_only=True):
     """
 
     value: Number
-    standard_error: Number
+    standard_error: NonNegative | None
     low: Number = None
     high: Number = None
     confidence: Number = None
@@ -90,10 +76,6 @@ class TraceOf(Struct, kw_only=True):
     method: str
     note: Maybe[str] = UNSET
     views_error: Maybe[Number] = UNSET
-
-    def __post_init__(self) -> None:
-        require_order(zero=0.0, standard_error=self.standard_error)
-        require_order(low=self.low, value=self.value, high=self.high)
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -148,14 +130,11 @@ class End(Struct, kw_only=True):
     """
 
     value: Number
-    residual: Number
+    residual: NonNegative | None
     vector_error: Number = None
     reason: str | None = None
     note: Maybe[str] = UNSET
     views_error: Maybe[Number] = UNSET
-
-    def __post_init__(self) -> None:
-        require_order(zero=0.0, residual=self.residual)
 
     @property
     def is_reached(self) -> bool:
@@ -243,10 +222,6 @@ class Eigenvalues(Named[Eigenvalue], kw_only=True):
         """Whether neither end is doubted."""
         return not (self.max.doubted or self.min.doubted)
 
-    def __post_init__(self) -> None:
-        second = self.second.value if self.second else None
-        require_order(min=self.min.value, second=second, max=self.max.value)
-
 
 class Index(Struct, kw_only=True):
     """An index and its bracket.  value: None where undefined; low, high: None where unbounded."""
@@ -256,11 +231,6 @@ class Index(Struct, kw_only=True):
     high: Number
     note: str
 
-    def __post_init__(self) -> None:
-        """A bracket that leads through infinity, of a ratio whose denominator may be 0, lacks an end, or low is above high."""
-        if self.low is not None and self.high is not None and self.low <= self.high:
-            require_order(low=self.low, value=self.value, high=self.high)
-
 
 class Anisotropy(Named[Index], kw_only=True):
     """The indices of `landscape.spectrum.anisotropy`."""
@@ -269,13 +239,6 @@ class Anisotropy(Named[Index], kw_only=True):
     negative_ratio: Maybe[Index] = UNSET
     top_mass: Maybe[Index] = UNSET
     participation_ratio: Maybe[Index] = UNSET
-
-    def __post_init__(self) -> None:
-        """All but `eigenvalue_ratio`, whose denominator may be 0, are in brackets; a mass is at most 1, none is negative."""
-        for name, found in self.items():
-            if name != "eigenvalue_ratio":
-                require_order(zero=0.0, value=found.value, one=1.0 if name == "top_mass" else None)
-                require_order(low=found.low, value=found.value, high=found.high)
 
 
 INDICES = Anisotropy.__struct_fields__
@@ -469,8 +432,6 @@ class Slice(Struct, kw_only=True):
     note: Maybe[str] = UNSET
 
     def __post_init__(self) -> None:
-        require_order(crossed_points=self.crossed_points, points=self.points)
-        require_order(evaluated_points=self.evaluated_points, points=self.points)
         if self.resolved is False and self.evaluated_points is None:
             raise ValueError("Expected `evaluated_points` of a plane that is not resolved, got none")
 
