@@ -48,7 +48,6 @@ from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
 from splat.model.typed import leaves, typed
 from splat.model.untrusted import beside, locked, replacing
-from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, explicit_split, read_names, split_scene, usual_views
 from splat.scenes.view import View
@@ -164,8 +163,6 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     views, held_out = scene.load(split.train), scene.load(split.test)
     for together in (views, held_out):
         have_masks(together)
-    if options.depths:
-        require_depths(views, options.depths)
     if options.resume:
         training = resumed(out / CHECKPOINT, config, reference).training
     else:

@@ -24,7 +24,6 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from splat.model.untrusted import ImageFile, open_image, read_array, require_content
-from splat.scenes.view import View
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".npy", ".png")
@@ -78,16 +77,6 @@ def find_layer(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> P
             stems.append(f"{number:03d}")
     candidates = (folder / f"{stem}{suffix}" for stem in stems for suffix in suffixes)
     return next((path for path in candidates if path.is_file()), None)
-
-
-def require_depths(views: Sequence[View], folder: Path) -> None:
-    """ValueError unless every view has a depth map."""
-    without = [view.name for view in views if view.depth is None]
-    if without:
-        raise InputError(
-            f"expected a depth map for each of the {len(views)} training views in {folder}, got none for {without[0]}; "
-            f"save it as {PurePosixPath(without[0]).stem}.npy"
-        )
 
 
 def read_mask(path: Path) -> Float[Tensor, "1 h w"]:

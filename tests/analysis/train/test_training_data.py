@@ -210,14 +210,16 @@ def test_depth_maps_must_be_there_for_every_training_view(original, tmp_path, ca
     (tmp_path / "depth").mkdir()
     for i, path in enumerate(images(original)):
         np.save(tmp_path / "depth" / f"{path.stem}.npy", np.arange(18 * 24).reshape(18, 24) + i)
-    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "depth")) == 0
+    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "depth"), "--method", "dngaussian") == 0
     chosen = load_checkpoint(tmp_path / "run/checkpoint.pt").scene.train[1]
     missing = f"{Path(chosen).stem}.npy"
     (tmp_path / "depth" / missing).unlink()
     capsys.readouterr()
-    assert train(original, tmp_path / "again", "--depths", str(tmp_path / "depth")) == 2
+    assert train(original, tmp_path / "again", "--depths", str(tmp_path / "depth"), "--method", "dngaussian") == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert f"got none for {chosen}; save it as {missing}" in said and not (tmp_path / "again").exists()
+    assert (
+        f"got none of '{chosen}' (1 of 3 have none); save it as {missing}" in said and not (tmp_path / "again").exists()
+    )
 
 
 def test_a_method_that_lacks_its_depth_maps_is_refused_before_there_is_a_folder(original, tmp_path, capsys):

@@ -7,6 +7,7 @@ Monocular depth is known up to a scale and a shift in every view, so both method
 """
 
 from collections.abc import Sequence
+from pathlib import PurePosixPath
 from typing import Literal
 
 from jaxtyping import Float
@@ -24,7 +25,8 @@ def require_maps(views: Sequence[View], method: str) -> None:
     if without:
         raise InputError(
             f"expected a depth map of every training view for the method {method}, got none of {without[0]!r} "
-            f"({len(without)} of {len(views)} have none); give a folder of them with --depths"
+            f"({len(without)} of {len(views)} have none); save it as {PurePosixPath(without[0]).stem}.npy in a folder, and "
+            "give that with --depths"
         )
 
 
