@@ -36,6 +36,7 @@ from landscape.operators.checks import ROUND_OFFS
 from landscape.results import Progress
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.linearize import LinearizedView
+from splat.curvature.null.active_spaces import without_lengths
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import view_loss
 from splat.model.camera import Camera
@@ -75,7 +76,8 @@ def check_against_gradient(
 ) -> ProductCheck:
     """The relative error of H_m v for one random v.  views: how many to take, spread evenly over all."""
     objective, found = hessian.objective, []
-    direction = _without_lengths(objective.active, _direction(objective, generator)[:, None])[:, 0]
+    turns = objective.active.quats, objective.blocks["quats"]
+    direction = without_lengths(_direction(objective, generator)[:, None], *turns)[:, 0]
     count = len(objective.views)
     for index in sorted({round(i) for i in np.linspace(0, count - 1, min(views, count))}):
         found.append(_of_view(objective, index, direction))
@@ -115,7 +117,8 @@ def _in_double(objective: SceneObjective, view: View) -> SceneObjective:
 
 def _product(view: LinearizedView, direction: Float[Tensor, " p"]) -> Float64[Tensor, " p"]:
     """P H_m v."""
-    return _without_lengths(view.gaussians, view.hvp(direction[:, None]))[:, 0].double()
+    turns = view.gaussians.quats, view.gaussians.blocks["quats"]
+    return without_lengths(view.hvp(direction[:, None]), *turns)[:, 0].double()
 
 
 def _differences(
@@ -166,7 +169,9 @@ class _Gradient:
         loss = view_loss(image, self.loss) + self.weight * (turned * image).sum()
         _pull(torch.autograd.grad(loss, moving), at, total, self.camera, self.settings)
         self.regularizers(at).add_gradient(total.flat)
-        return _without_lengths(self.active, total.flat[:, None])[:, 0], image.detach()
+        return without_lengths(total.flat[:, None], self.active.quats, self.active.blocks["quats"])[
+            :, 0
+        ], image.detach()
 
 
 def _chunks(gaussians: Gaussians) -> Iterator[tuple[slice, Gaussians]]:
@@ -186,14 +191,6 @@ def _pull(
         (gradient,) = torch.autograd.grad(found, some.flat, [adjoint[rows] for adjoint in adjoints])
         for sum_of, part in zip(total.attributes.values(), some.with_flat(gradient).attributes.values(), strict=True):
             sum_of[rows] += part
-
-
-def _without_lengths(gaussians: Gaussians, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-    """V without its components along the (unit) quaternions: the only null directions in which a gradient has any."""
-    V, q = V.clone(), gaussians.quats[:, :, None]
-    quats = V[gaussians.blocks["quats"]].view(len(gaussians), 4, -1)
-    quats -= q * (q * quats).sum(dim=1, keepdim=True)
-    return V
 
 
 def _direction(objective: SceneObjective, generator: torch.Generator) -> Float[Tensor, " p"]:

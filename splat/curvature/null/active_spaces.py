@@ -58,12 +58,7 @@ class Projector:
 
         H maps this and P V to the same: H is zero along all other directions that P removes.
         """
-        if self.radial is None:
-            return V
-        V, radial = V.clone(), self.radial[:, :, None]
-        quats = V[self.blocks["quats"]].view(len(radial), 4, -1)
-        quats -= radial * (radial * quats).sum(dim=1, keepdim=True)
-        return V
+        return V if self.radial is None else without_lengths(V, self.radial, self.blocks["quats"])
 
     def scaled(self, scale: Float[Tensor, " p"]) -> "Projector":
         """The orthogonal projector onto all D P x, D = diag(scale) > 0."""
@@ -72,6 +67,14 @@ class Projector:
             return Projector(self.blocks, self.seen.scaled(torch.cat([*parts.values()], dim=1)))
         radial = torch.nn.functional.normalize(self.radial / parts["quats"], dim=1)
         return Projector(self.blocks, self.seen.scaled(parts["sh"]), radial)
+
+
+def without_lengths(V: Float[Tensor, "p k"], quats: Float[Tensor, "n 4"], rows: slice) -> Float[Tensor, "p k"]:
+    """V without its components along unit quaternions, of these rows: a quaternion's length changes no image."""
+    V, q = V.clone(), quats[:, :, None]
+    turns = V[rows].view(len(q), 4, -1)
+    turns -= q * (q * turns).sum(dim=1, keepdim=True)
+    return V
 
 
 def projector_of(objective: SceneObjective, *, gauss_newton: bool = False, single: bool = False) -> Projector:

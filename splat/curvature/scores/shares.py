@@ -26,8 +26,8 @@ from landscape.probes import draw_probes
 from landscape.results import Progress
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, PerGaussianBlocks
 from splat.curvature.hessian import ViewSum
+from splat.curvature.null.active_spaces import without_lengths
 from splat.curvature.objective import SceneObjective
-from splat.model.gaussians import Gaussians
 from splat.render.backend import backend_of
 
 
@@ -90,7 +90,8 @@ def block_shares(
 def _share(operator: ViewSum, blocks: PerGaussianBlocks, Z: Float[Tensor, "p s"]) -> BlockShare:
     """operator: H; blocks: of P H P."""
     objective = operator.objective
-    product = _across(objective.active, operator.apply(_across(objective.active, Z)) / len(objective.views))
+    turns = objective.active.quats, objective.blocks["quats"]
+    product = without_lengths(operator.apply(without_lengths(Z, *turns)) / len(objective.views), *turns)
     rest = (product - blocks.apply(Z, objective.active)).double().square().sum(dim=0)
     geometry, sh = blocks.geometry.double().square(), float(blocks.sh.double().square().sum())
     diagonal = float(geometry.diagonal(dim1=1, dim2=2).sum()) + sh
@@ -111,11 +112,3 @@ def _share(operator: ViewSum, blocks: PerGaussianBlocks, Z: Float[Tensor, "p s"]
         error,
         samples,
     )
-
-
-def _across(gaussians: Gaussians, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-    """P V: without the lengths of the unit quaternions."""
-    result, q = V.clone(), gaussians.quats[:, :, None]
-    turns = result[gaussians.blocks["quats"]].view(*q.shape[:2], -1)
-    turns -= q * (q * turns).sum(dim=1, keepdim=True)
-    return result

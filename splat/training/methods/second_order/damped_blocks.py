@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splat.backend.cpu.absolute import absolute_values
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, PerGaussianBlocks
+from splat.curvature.null.active_spaces import without_lengths
 from splat.model.gaussians import Gaussians
 
 SLACK = 10  # eps of a block's trace: what rounding makes negative
@@ -36,10 +37,7 @@ class DampedBlocks:
 
     def project(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """P V, of theta and y alike: a quaternion's four unknowns have one S."""
-        V, radial = V.clone(), self.gaussians.quats[:, :, None]
-        quats = V[self._rows["quats"]].view(len(radial), 4, -1)
-        quats -= radial * (radial * quats).sum(dim=1, keepdim=True)
-        return V
+        return without_lengths(V, self.gaussians.quats, self._rows["quats"])
 
     def inverse(self, damping: float, diagonal: bool = False) -> "Inverse":
         """M; diagonal: of the diagonals alone (Jacobi)."""
