@@ -1,4 +1,4 @@
-"""`landscape demo`: make a synthetic scene, train on three of its views, probe the result, say what to open.
+"""`landscape demo`: make a synthetic scene, train on three of its views, probe the result, say what to open; or go on with one.
 
 OUT/scene    the scene (`splat.scenes.synthetic`) as transforms.json with pictures
 OUT/run      the training, and in OUT/run/probe the record of the probe
@@ -25,23 +25,27 @@ VIEWS, ITERATIONS = 3, 600
 
 
 def run_demo(options: DemoOptions) -> int:
-    """Make, train, probe; returns the exit code."""
+    """Make, train, probe, what is not done yet; returns the exit code."""
     out = free_folder(options.out)
     if out != options.out:
         say(f"{options.out} exists, so this run goes to {out}")
     say("the first run compiles the kernels, which takes about a minute; later runs find them in a cache")
-    with Console(stderr=True).status("making a synthetic scene"):
-        write_transforms_scene(synthetic_scene(SCENE).scene, out / "scene")
-    training = TrainOptions(out / "scene", out=out / "run", views=VIEWS, iterations=ITERATIONS)
-    typed = ["train", str(training.scene), "--out", str(training.out), "--views", str(VIEWS)]
-    typed += ["--iterations", str(ITERATIONS)]
-    checkpoint = out / "run" / CHECKPOINT
+    if not (out / "scene").exists():
+        with Console(stderr=True).status("making a synthetic scene"):
+            write_transforms_scene(synthetic_scene(SCENE).scene, out / "scene")
+    run, checkpoint = out / "run", out / "run" / CHECKPOINT
+    begun = checkpoint.is_file()
+    training = TrainOptions(out / "scene", out=run, views=VIEWS, iterations=ITERATIONS, resume=begun)
+    typed = ["train", str(training.scene), "--out", str(run), "--views", str(VIEWS)]
+    typed += ["--iterations", str(ITERATIONS), *(["--resume"] if begun else [])]
     _announce(typed)
     if code := run_training(training, ["landscape", *typed]):
         return code
     typed = ["probe", str(checkpoint)]
     _announce(typed)
-    return run_probe(ProbeOptions(checkpoint), ["landscape", *typed])
+    code = run_probe(ProbeOptions(checkpoint), ["landscape", *typed])
+    say(f"open the report in a browser; next: landscape map {shlex.quote(str(run))}, or view in place of map")
+    return code
 
 
 def _announce(arguments: list[str]) -> None:
@@ -50,8 +54,7 @@ def _announce(arguments: list[str]) -> None:
 
 
 def free_folder(wanted: Path) -> Path:
-    """wanted, or the first of wanted-2, wanted-3, ... that does not exist yet."""
-    if not wanted.exists():
-        return wanted
-    candidates = (wanted.with_name(f"{wanted.name}-{number}") for number in count(2))
-    return next(folder for folder in candidates if not folder.exists())
+    """The first of wanted, wanted-2, wanted-3, ... that does not exist yet, or holds a demo that was interrupted."""
+    candidates = (wanted if n == 1 else wanted.with_name(f"{wanted.name}-{n}") for n in count(1))
+    left = (each for each in candidates if not (each / "run" / "probe").exists())
+    return next(each for each in left if not each.exists() or (each / "scene").exists())

@@ -77,4 +77,4 @@ class DemoOptions:
     """Train and probe an embedded synthetic scene, and say which page to open."""
 
     out: Path = Path("runs/demo")
-    """Folder of the demo's scene and run.  Where it exists, the next free of OUT-2, OUT-3, ... is used."""
+    """Folder of the demo's scene and run.  An interrupted demo is continued; a whole one stays, and OUT-2, ... is used."""

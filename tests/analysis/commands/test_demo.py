@@ -1,10 +1,15 @@
 """The demo: a scene, a run and a record, and a second run that leaves the first alone."""
 
+import os
+import signal
+
 import pytest
+import torch
 
 from analysis.commands.cli import main
 from analysis.commands.demo import free_folder
 from analysis.records.records import read_record
+from splat.render.forward import background_of
 from splat.scenes.synthetic import SyntheticSettings
 from splat.training.checkpoint import load_checkpoint
 
@@ -32,6 +37,38 @@ def test_the_demo_makes_a_scene_trains_probes_and_says_what_to_open(small, tmp_p
     first, second = (read_record(tmp_path / name / "run" / "probe").data for name in ("demo", "demo-2"))
     assert first.counts.gaussians == second.counts.gaussians
     assert first.objective == second.objective
+
+
+def test_an_interrupted_demo_is_continued_where_it_was(small, tmp_path, capsys, monkeypatch):
+    whole, out, presses, probed = tmp_path / "whole", tmp_path / "demo", [], []
+    monkeypatch.setattr("analysis.commands.demo.run_probe", lambda options, _: probed.append(options.checkpoint) or 0)
+
+    def press(*given):
+        presses.append(1)
+        if len(presses) == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+        return background_of(*given)
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    assert main(["demo", "--out", str(whole)]) == 0
+    for place, by, step in (
+        ("synthetic_scene", stopped, None),
+        ("splat.render.loss_and_gradient.background_of", press, 4),
+        ("run_training", stopped, 4),
+        ("run_probe", stopped, 12),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(place if "." in place else f"analysis.commands.demo.{place}", by)
+            assert main(["demo", "--out", str(out)]) == 130
+        assert step is None or load_checkpoint(out / "run" / "checkpoint.pt").training.step == step
+    capsys.readouterr()
+    assert main(["demo", "--out", str(out)]) == 0
+    assert f"next: landscape map {out}/run" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demo", "whole"]
+    flat, other = (load_checkpoint(each / "run" / "checkpoint.pt").training.gaussians.flat for each in (out, whole))
+    assert torch.equal(flat, other) and probed == [each / "run" / "checkpoint.pt" for each in (whole, out)]
 
 
 def test_a_free_folder_is_the_first_that_does_not_exist(tmp_path):
