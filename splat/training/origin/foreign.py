@@ -52,9 +52,8 @@ def foreign_training(
     train: names of the training views, where known.  picture: where render and photograph are written side by side when
     they do not agree.  InputError then, and for what is missing or cannot be.
     """
-    if ask.scene is None:
-        raise InputError(f"expected --scene FOLDER for {path}: a file of another tool does not name its scene")
     found = read_splats(path)
+    _require_said(found, ask, path, train)
     name, source = preset_of(found.tool, ask.trained_by)
     preset = PRESETS[name]
     antialiased = found.antialiased or ask.antialiased
@@ -83,6 +82,29 @@ def foreign_training(
     said |= {"images": images, "downscale": downscale}
     conventions = asdict(replace(preset, render=render, loss=config.loss))
     return training, reference, {**said, "psnr": level, "similarity": similarity, "preset": conventions}
+
+
+def _require_said(found: SplatFile, ask: Foreign, path: Path, train: Sequence[str] | None) -> None:
+    """InputError that names all that is neither asked for nor said by the file, or by what lies beside it."""
+    asked = (ask.train_list, ask.guess_views, train is not None, ask.views is not None)
+    views = any((*asked, found.train, "eval" in found.settings))
+    if not views and ask.scene is not None:
+        scene = load_scene(ask.scene, ask.images)
+        views = split_scene(scene).protocol == "named" or (found.settings and _used(path, scene))
+    of = f"the original 3DGS; one of {', '.join(PRESETS)}{f', got {found.tool!r} in the file' if found.tool else ''}"
+    needs = {
+        "--scene SCENE": ("its folder", ask.scene),
+        "--trained-by graphdeco": (of, ask.trained_by or found.tool in PRESETS),
+        "--views 3": (
+            "by the scene's protocol; or --train-list FILE, or --guess-views as its tool does by default",
+            views,
+        ),
+    }
+    if lacking := {words: about for words, (about, said) in needs.items() if not said}:
+        what = " and ".join(f"{words} ({about})" for words, about in lacking.items())
+        raise InputError(
+            f"expected {what} for {path}, as neither it nor a file beside it says so, got none; add {' '.join(lacking)}"
+        )
 
 
 def _scene(found: SplatFile, ask: Foreign, preset: Preset) -> tuple[Scene, str | None, float]:
@@ -134,12 +156,6 @@ def _split(scene: Scene, found: SplatFile, ask: Foreign, path: Path, train: Sequ
         return held_out, "from cfg_args"
     if held_out.protocol == "named":
         return held_out, "as the scene's file lists them"
-    if not ask.guess_views:
-        raise InputError(
-            f"expected the training views of {path}, which neither it nor a file beside it names, got none; name them with "
-            "--views N (by the scene's protocol) or --train-list FILE, or say --guess-views for those that its tool holds by "
-            "default"
-        )
     if found.tool == "nerfstudio" and scene.kind == "transforms":
         count = len(scene.names)
         places = np.linspace(0, count - 1, ceil(count * NERFSTUDIO_SHARE), dtype=int)

@@ -103,11 +103,9 @@ def preset_of(said: str | None, asked: str | None) -> tuple[str, str]:
     >>> preset_of("brush", None)
     ('brush', 'the file')
     """
-    name = asked or said
-    if name is not None and name in PRESETS:
+    if (name := asked or said or "nothing") in PRESETS:
         return name, "asked for" if asked else "the file"
-    found = f"the file, which says {said!r}" if asked is None and said else (asked or "nothing in the file")
     raise InputError(
-        f"expected --trained-by with one of {', '.join(PRESETS)}, whose conventions to follow, got {found}; of the "
-        "original 3DGS: graphdeco"
+        f"expected --trained-by with one of {', '.join(PRESETS)}, whose conventions to follow, got {name}; of the original "
+        "3DGS: graphdeco"
     )

@@ -51,6 +51,11 @@ def test_one_sentence_for_what_is_no_fault_of_the_program(monkeypatch, capsys, e
     assert said.startswith("landscape: ") and said.count("\n") == 1
 
 
+def test_what_a_command_lacks_is_added_to_it(monkeypatch, capsys):
+    code, said = ended(monkeypatch, capsys, InputError("expected --views N, got none; add --views 3"))
+    assert (code, said) == (2, "landscape: expected --views N, got none; take: landscape demo --views 3\n")
+
+
 @pytest.mark.parametrize("error", [ValueError("shapes"), KeyError("x"), AssertionError(), OSError(errno.EIO, "I/O")])
 def test_a_fault_shows_its_traceback_and_how_to_report_it(monkeypatch, capsys, error):
     code, said = ended(monkeypatch, capsys, error)

@@ -169,10 +169,14 @@ def test_an_spz_is_read_in_the_axes_in_which_it_looks_like_the_scene(folder):
 @pytest.mark.parametrize(
     ("comments", "ask", "message"),
     [
-        ((), {}, "expected --trained-by with one of graphdeco, gsplat"),
-        (("trained by someone",), {}, "which says 'someone'"),
+        (
+            (),
+            {},
+            r"expected --trained-by graphdeco \(.*; one of graphdeco, gsplat.*\) for .*a\.ply.*; add --trained-by graphdeco$",
+        ),
+        (("trained by someone",), {}, r"expected --trained-by .*, got 'someone' in the file\)"),
         ((), {"trained_by": "nobody"}, "got nobody"),
-        ((), {"trained_by": OURS, "scene": None}, "expected --scene FOLDER"),
+        ((), {"trained_by": OURS, "scene": None}, "expected --scene SCENE"),
         ((), {"trained_by": OURS, "views": 2, "train_list": Path("views.txt")}, "--views or --train-list"),
         ((), {"trained_by": OURS, "train": ("nothing",)}, "name of one view"),
         ((), {"trained_by": "nerfstudio"}, "dataparser_transforms.json"),
@@ -255,10 +259,29 @@ def test_views_are_asked_for_or_read_or_guessed_and_said(folder, settings, camer
 
 def test_views_that_nothing_names_are_asked_for(folder):
     path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
-    with pytest.raises(
-        InputError, match=r"training views of .*a\.ply.*got none; .*--views N.*--train-list.*--guess-views"
-    ):
-        opened(path, guess_views=False, trained_by=OURS)
+    refused(
+        r"expected --views 3 .*--train-list.*--guess-views.* for .*a\.ply",
+        opened,
+        path,
+        guess_views=False,
+        trained_by=OURS,
+    )
+
+
+@pytest.mark.parametrize(
+    ("ask", "more"),
+    [
+        ({}, "--trained-by graphdeco --views 3"),
+        ({"scene": None}, "--scene SCENE --trained-by graphdeco --views 3"),
+        ({"scene": None, "trained_by": "gsplat-raw"}, "--scene SCENE --views 3"),
+        ({"scene": None, "views": 2}, "--scene SCENE --trained-by graphdeco"),
+        ({"trained_by": "gsplat-raw"}, "--views 3"),
+    ],
+)
+def test_all_that_is_missing_is_said_at_once_with_the_words_that_the_command_lacks(folder, ask, more):
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
+    sentence = refused(rf"; add {more}$", opened, path, guess_views=False, **ask)
+    assert set(re.findall(r"--(?:scene|trained-by|views)\b", sentence)) == set(re.findall(r"--[\w-]+", more))
 
 
 @pytest.mark.parametrize("kind", ["ply", "gsplat"])
