@@ -22,8 +22,8 @@ DIGITS = 3  # significant
 AGREES = 0.2  # largest |ratio - 1| of two numbers that are said to agree
 BYTES, NOTHING = 254, 255  # of a scale in bytes: its upper end, and the code of no value
 GREY = 128  # the colour of no value, in bytes
-SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}  # of metrics.json
-PLACES = {"psnr": 2, "ssim": 4, "lpips": 4}
+SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS (VGG)", "avge": "AVGE"}  # of metrics.json
+PLACES = {"psnr": 2, "ssim": 4, "lpips": 4, "avge": 4}
 
 
 def quantity(value: float | None, error: float | None = None) -> str:

@@ -51,7 +51,7 @@ _TRAJECTORY = "the records of landscape train --probe-every"
 
 
 class ViewScores(Struct, kw_only=True):
-    """Means over views; psnr in dB, infinite for perfect images; lpips: None where it cannot be computed.
+    """Means over views; psnr in dB, infinite for perfect images; lpips, avge: None where they cannot be computed.
 
     views: those of each, by its name.
     """
@@ -59,6 +59,7 @@ class ViewScores(Struct, kw_only=True):
     psnr: Number = None
     ssim: Number = None
     lpips: Number = None
+    avge: Number = None
     views: dict[str, "ViewScores"] = {}
 
 

@@ -24,6 +24,7 @@ from torch import Tensor
 from analysis.console.plain import say
 from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance
+from analysis.records.quantities import PLACES, SCORES
 from analysis.records.run_files import CHECKPOINT, METRICS
 from analysis.train.training_time import TrainingTime
 from splat.model.untrusted import short, write_atomically
@@ -123,7 +124,7 @@ def panel(image: Float[Tensor, "3 h w"], view: View) -> UInt8[np.ndarray, "h w3 
 
 def _scores(evaluation: Evaluation) -> dict[str, Any]:
     def of(scores: ViewScore | Evaluation) -> dict[str, Any]:
-        return {"psnr": scores.psnr, "ssim": scores.ssim, "lpips": scores.lpips}
+        return {key: getattr(scores, key) for key in SCORES}
 
     return {**of(evaluation), "masked": evaluation.masked, "views": {view.name: of(view) for view in evaluation.views}}
 
@@ -132,13 +133,12 @@ def _table(seen: Evaluation, tested: Evaluation | None) -> Table:
     shown = tested or seen
     title = "held-out views" if tested else "training views"
     table = Table("view", title=f"{title}, inside their masks" if shown.masked else title)
-    columns = {"PSNR (dB)": "psnr", "SSIM": "ssim", **({} if shown.lpips is None else {"LPIPS": "lpips"})}
-    for column in columns:
-        table.add_column(column, justify="right")
+    columns = [key for key in SCORES if getattr(shown, key) is not None]
+    for key in columns:
+        table.add_column(SCORES[key], justify="right")
 
     def row(name: str, scores: ViewScore | Evaluation, style: str | None = None) -> None:
-        values = [getattr(scores, key) for key in columns.values()]
-        cells = ["" if v is None else f"{v:.{2 if key == 'psnr' else 4}f}" for v, key in zip(values, columns.values())]
+        cells = ["" if (value := getattr(scores, key)) is None else f"{value:.{PLACES[key]}f}" for key in columns]
         table.add_row(escape(name), *cells, style=style)
 
     if tested:

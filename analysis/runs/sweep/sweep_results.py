@@ -1,8 +1,8 @@
 """Results of the cells of a sweep: a row a cell, and mean and standard deviation over the seeds.
 
 OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or "to do"); once it is trained: psnr (dB),
-                  ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads (that
-                  its steps might use; none where a resume changed them), peak_memory (bytes of the process), cpu_ratio
+                  ssim, lpips, avge of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads
+                  (that its steps might use; none where a resume changed them), peak_memory (bytes of the process), cpu_ratio
                   (of cpu_seconds to those of the first method, of the same scene and seed); where it was probed,
                   trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error (standard error or residual), of the latter
                   also the _reason why the search ended ("... budget": the end may lie farther out), and the anisotropy
@@ -146,7 +146,7 @@ def tables(summary: pd.DataFrame) -> list[Table]:
     parts = {
         "mean ± standard deviation over the seeds": TRAINING,
         "traces": traces,
-        "ends of the spectrum": ends,
+        "extreme eigenvalues": ends,
         "anisotropy": indices,
         "what splitting every Gaussian in two multiplies the anisotropy by": split,
     }

@@ -34,6 +34,11 @@ class ViewScore:
     ssim: float
     lpips: float | None = None
 
+    @property
+    def avge(self) -> float | None:
+        """Geometric mean of 10^(-PSNR / 10), sqrt(1 - SSIM) and LPIPS (Niemeyer et al., *RegNeRF*, 2022); None without it."""
+        return self.lpips and (10 ** (-self.psnr / 10) * max(1 - self.ssim, 0.0) ** 0.5 * self.lpips) ** (1 / 3)
+
 
 @dataclass(frozen=True, repr=False)
 class Evaluation(ShortRepr):
@@ -52,8 +57,15 @@ class Evaluation(ShortRepr):
 
     @property
     def lpips(self) -> float | None:
-        known = [view.lpips for view in self.views if view.lpips is not None]
-        return fmean(known) if len(known) == len(self.views) else None
+        return self._mean("lpips")
+
+    @property
+    def avge(self) -> float | None:
+        return self._mean("avge")
+
+    def _mean(self, name: str) -> float | None:
+        known = [getattr(view, name) for view in self.views]
+        return None if None in known else fmean(known)
 
 
 @torch.no_grad()
