@@ -10,11 +10,11 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, redirect_stderr
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from importlib.metadata import version
-from io import TextIOWrapper
+from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import IO, Any, NoReturn
 
@@ -34,6 +34,17 @@ from analysis.train.options import TrainOptions
 from landscape.errors import InputError, did_you_mean
 
 DEBUG, CHECKPOINT = "--debug", "checkpoint.pt"
+LPIPS = "LPIPS is a score too after: pip install 'splat-landscape[lpips]'"  # the end of train's help
+DRAWN = re.compile(r"\x1b\[[\d;]*m|[\u2500-\u257f]|-{5,}|^[+|]|[+|]$", re.M)  # colours and lines of a box
+SENTENCES = {  # what the parser says in a box, in which words
+    r"Error parsing [^:]+: [^']*('.*?').*helptext:\s+([^\n]*\S)": r"expected \2, got \1",
+    r"invalid choice (.+?) for argument '(.+?)'\.\s+Expected one of\s+\((.+?)\)": r"expected \2 with one of \3, got \1",
+    r"Missing value for argument '(.+?)'": r"expected a value after \1, got none",
+    r"Missing from [^:]+:\s+([^\n]*\S)": r"expected \1, got none",
+    r"Unrecognized options: (.+?)\s+(?:Perhaps|Arguments)[^:]*:\s+(\S+)": r"expected its options, got \1; did you mean \2?",
+    r"Unrecognized options: (.+?)\s+For full": r"expected no more words, got \1",
+    r"(.+)": r"expected options that can be read, got: \1",
+}
 
 
 @dataclass(frozen=True)
@@ -42,7 +53,7 @@ class Command:
     words after its name that are shown in its help.
 
     recorded: the function is also given the command as typed; draws: and a `Draw` of this module of figures, whose process
-    starts at once; compiles: it says so when kernels are compiled.
+    starts at once; compiles, or recorded: it says so when kernels are compiled.
     """
 
     options: type
@@ -57,27 +68,16 @@ GROUPS = {  # as a person works
     "make": {
         "sfm": Command(SfmOptions, "analysis.commands.sfm:run_sfm", "PHOTOS"),
         "train": Command(
-            TrainOptions,
-            "analysis.train.command:run_training",
-            "SCENE --views 3 --out runs/fern",
-            recorded=True,
-            compiles=True,
+            TrainOptions, "analysis.train.command:run_training", "SCENE --views 3 --out runs/fern", recorded=True
         ),
         "sweep": Command(SweepOptions, "analysis.runs.sweep.sweep:run_sweep", "notebooks/study_small.toml"),
         "demo": Command(DemoOptions, "analysis.commands.demo:run_demo", "", compiles=True),
     },
     "measure": {
         "probe": Command(
-            ProbeOptions,
-            "analysis.commands.uses.renderer:run_any_probe",
-            "runs/fern",
-            recorded=True,
-            draws="make_all",
-            compiles=True,
+            ProbeOptions, "analysis.commands.uses.renderer:run_any_probe", "runs/fern", recorded=True, draws="make_all"
         ),
-        "slice": Command(
-            SliceOptions, "analysis.slice.command:run_slice", "runs/fern --along gradient", recorded=True, compiles=True
-        ),
+        "slice": Command(SliceOptions, "analysis.slice.command:run_slice", "runs/fern --along gradient", recorded=True),
         "compare": Command(CompareOptions, "analysis.runs.compare:run_compare", "runs/fern runs/fern-stable"),
         "trajectory": Command(
             TrajectoryOptions, "analysis.runs.trajectories:run_trajectory", "runs/fern runs/fern-stable"
@@ -85,24 +85,16 @@ GROUPS = {  # as a person works
         "bench": Command(BenchOptions, "analysis.bench.command:run_bench", "runs/fern"),
     },
     "see": {
-        "map": Command(
-            MapOptions, "analysis.commands.map.command:run_map", "runs/fern", recorded=True, draws="maps", compiles=True
-        ),
+        "map": Command(MapOptions, "analysis.commands.map.command:run_map", "runs/fern", recorded=True, draws="maps"),
         "view": Command(ViewOptions, "analysis.commands.view.command:run_view", "runs/fern", compiles=True),
     },
     "use": {
-        "prune": Command(
-            PruneOptions, "analysis.commands.uses.prune:run_prune", "runs/fern --keep 0.5", recorded=True, compiles=True
-        ),
+        "prune": Command(PruneOptions, "analysis.commands.uses.prune:run_prune", "runs/fern --keep 0.5", recorded=True),
         "next-view": Command(
-            NextViewOptions, "analysis.commands.uses.next_view:run_next_view", "runs/fern", recorded=True, compiles=True
+            NextViewOptions, "analysis.commands.uses.next_view:run_next_view", "runs/fern", recorded=True
         ),
         "uncertainty": Command(
-            UncertaintyOptions,
-            "analysis.commands.uses.uncertainty:run_uncertainty",
-            "runs/fern",
-            recorded=True,
-            compiles=True,
+            UncertaintyOptions, "analysis.commands.uses.uncertainty:run_uncertainty", "runs/fern", recorded=True
         ),
     },
     "exchange": {
@@ -193,19 +185,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parsed(arguments: Sequence[str]) -> tuple[Command, Any]:
     """A command and its options, which are parsed alone: an error advises about this command.
 
-    SystemExit for help, and where they cannot be parsed; InputError for a command that there is not.
+    SystemExit for help; InputError where they cannot be parsed, and for a command that there is not.
     """
     name = (*arguments, "")[0]
     if found := COMMANDS.get(name):
         elsewhere = name != "convert" and bool({"-h", "--help"} & {*arguments})
-        return found, tyro.cli(
-            found.options,
-            prog=f"landscape {name}",
-            description=_about(name, found),
-            args=arguments[1:],
-            config=(tyro.conf.DisallowNone,),
-            registry=registry(foreign=not elsewhere),
-        )
+        try:
+            with redirect_stderr(StringIO()) as said:
+                return found, tyro.cli(
+                    found.options,
+                    prog=f"landscape {name}",
+                    description=_about(name, found),
+                    args=arguments[1:],
+                    config=(tyro.conf.DisallowNone,),
+                    registry=registry(foreign=not elsewhere),
+                )
+        except SystemExit as ended:
+            if not ended.code:
+                print(LPIPS if name == "train" else "")
+                raise
+        box = DRAWN.sub("", said.getvalue()).strip()
+        told = (match.expand(words) for pattern, words in SENTENCES.items() if (match := re.search(pattern, box, re.S)))
+        raise InputError(f"{next(told)}; landscape {name} --help has all options, and an example")
     if name in ("-h", "--help"):
         print(overview())
         raise SystemExit(0)
@@ -245,7 +246,7 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     name, function = command.runs.split(":")
     with ExitStack() as around:
         given = [options, ["landscape", *arguments]] if command.recorded else [options]
-        if command.compiles:
+        if command.compiles or command.recorded:
             from analysis.commands.compiling import compiling_is_said
 
             around.enter_context(compiling_is_said(Console(stderr=True)))

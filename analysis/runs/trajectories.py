@@ -78,7 +78,7 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
     for run, folder in zip(runs, folders, strict=True):
         path = folder / RECORDS
         if not folder.is_dir():
-            raise FileNotFoundError(f"expected the folder of a run, {run} does not exist")
+            raise FileNotFoundError(f"expected the folder of a run, {run} does not exist; name another")
         if not path.is_file():
             raise FileNotFoundError(
                 f"expected {RECORDS} in the run {run}, found none; train with --probe-every, as in "

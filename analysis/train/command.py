@@ -12,9 +12,9 @@
                                 (`analysis/train/trajectory.py`)
     RUN/test/                   renders of the held-out views at the end (`analysis/train/scores.py`)
     RUN/metrics.json            {"step", "method", "protocol", "gaussians", "train": scores, "test": scores or null, "seconds",
-                                "provenance"}, where scores are {"psnr", "ssim", "lpips", "masked", "views": {NAME: {"psnr",
-                                "ssim", "lpips"}}}: psnr in dB, "Infinity" for a perfect image; lpips null where it cannot be
-                                computed; masked: inside masks only
+                                "provenance"}, where scores are {"psnr", "ssim", "lpips", "avge", "masked", "views": {NAME:
+                                the first four}}: psnr in dB, "Infinity" for a perfect image; lpips and avge
+                                (`splat/training/score`) null where LPIPS cannot be computed; masked: inside masks only
 
 The run folder appears at once, with its first checkpoint.
 """
@@ -154,6 +154,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         raise InputError(f"expected keep_checkpoints of at least 0, or all, got {options.keep_checkpoints}")
     if options.track:
         tracker_module(options.track)  # refuses before anything is loaded
+    _asked(options, None)  # so do the settings
     along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_quick)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
@@ -230,9 +231,9 @@ def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
     return config.method.scaled(config, [key.removeprefix("method.") for key in assignments(options.set)])
 
 
-def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
-    """The settings as given: options over --set over the protocol's presets over defaults."""
-    red, green, blue = scene.background.tolist()
+def _asked(options: TrainOptions, scene: Scene | None) -> TrainConfig:
+    """The settings as given: options over --set over the protocol's presets over defaults; scene: of the background."""
+    red, green, blue = scene.background.tolist() if scene else COLOURS["black"]
     if options.method not in METHODS:
         meant = did_you_mean(options.method, METHODS)
         raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}{meant}")

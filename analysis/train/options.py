@@ -12,9 +12,7 @@ from splat.training.origin.options import Trainer
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Train 3D Gaussian Splatting on a few views of a scene and score it on the views held out.
-    LPIPS is a score too after: pip install 'splat-landscape[lpips]'
-    """
+    """Train 3D Gaussian Splatting on a few views of a scene and score it on the views held out."""
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
     """COLMAP, LLFF, Blender, instant-ngp, nerfstudio, DTU."""

@@ -137,7 +137,7 @@ def load_scene(
     root = Path(path)
     if not root.is_dir():
         raise FileNotFoundError(
-            f"expected a scene folder, {root} {'is not a folder' if root.exists() else 'does not exist'}"
+            f"expected a scene folder, {root} {'is not a folder' if root.exists() else 'does not exist'}; see landscape sfm"
         )
     if not 1 <= downscale < float("inf"):
         raise InputError(f"expected downscale of at least 1, got {downscale}")

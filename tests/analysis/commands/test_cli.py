@@ -178,7 +178,7 @@ def test_a_scene_that_cannot_be_is_refused(scene, tmp_path, capsys):
     def told(folder: Path, *words: str, options: tuple[str, ...] = ()) -> None:
         refuse(capsys, arguments(folder, tmp_path / "run", *options), *words)
 
-    told(tmp_path / "nothing", "nothing", "does not exist")
+    told(tmp_path / "nothing", "nothing does not exist; see landscape sfm")
     (tmp_path / "empty").mkdir()
     told(tmp_path / "empty", "camera poses", "empty folder")
     path = sorted((scene / "images").iterdir())[1]
@@ -215,6 +215,16 @@ def test_a_scene_that_cannot_be_is_refused(scene, tmp_path, capsys):
 )
 def test_options_that_cannot_be_are_refused(original, tmp_path, capsys, options, words):
     refuse(capsys, arguments(original, tmp_path / "run", *options.split()), words)
+
+
+@pytest.mark.parametrize("options", ["--iterations -5", "--sh-degree 4", "--method stablgs", "--set gama=1"])
+def test_settings_are_refused_before_folders_are_looked_at(tmp_path, capsys, options):
+    (out := tmp_path / "run").mkdir()
+    refuse(
+        capsys,
+        ["train", str(tmp_path / "nothing"), "--out", str(out), *options.split()],
+        options.split()[1].split("=")[0],
+    )
 
 
 def test_training_views_are_listed_in_a_file(original, tmp_path, capsys):
@@ -256,18 +266,35 @@ def test_a_checkpoint_whose_scene_has_moved_says_so_and_takes_its_folder(scene, 
 
 
 @pytest.mark.parametrize(
-    ("wrong", "page"),
+    ("wrong", "sentence"),
     [
-        (["train"], "landscape train --help"),
-        (["train", "scene", "--views", "three"], "landscape train --help"),
-        (["slice", "scene", "--wings", "2"], "landscape slice --help"),
+        ("train", "expected SCENE, got none"),
+        ("convert", "expected IN, got none"),
+        ("train scene --views three", "expected --views INT|{all}, got 'three'"),
+        ("train scene --save-at-psnr 30 high", "expected --save-at-psnr DB ..., got '30'"),
+        ("slice run --radius far", "expected --radius FLOAT, got 'far'"),
+        ("probe run --device gpu", "expected --device with one of 'auto', 'cpu', 'cuda', got 'gpu'"),
+        ("view run --port", "expected a value after --port, got none"),
+        ("slice run --wings 2", "expected no more words, got --wings, 2"),
+        ("train scene --veiws 3", "expected its options, got --veiws, 3; did you mean --views?"),
+        ("train scene --veiws 3 --quik", "expected its options, got --veiws, 3, --quik; did you mean --views?"),
     ],
 )
-def test_arguments_that_cannot_be_read_exit_with_2_and_name_their_help(wrong, page, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main(wrong)
-    said = capsys.readouterr().err
-    assert caught.value.code == 2 and page in said and said.count("--help") == 1
+@pytest.mark.parametrize("columns", ["50", "200"])
+def test_arguments_that_cannot_be_read_are_said_in_one_sentence(wrong, sentence, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    assert main(wrong.split()) == 2
+    one_sentence(capsys, f"landscape: {sentence}; landscape {wrong.split()[0]} --help has all options, and an example")
+
+
+def test_what_else_the_parser_says_is_passed_on(monkeypatch, capsys):
+    def refused(*_, **__):
+        print("╭─ \x1b[31mNews\x1b[0m ─╮\n│ the option is odd │\n╰─╯", file=sys.stderr)
+        raise SystemExit(2)
+
+    monkeypatch.setattr("analysis.commands.cli.tyro.cli", refused)
+    assert main(["demo"]) == 2
+    one_sentence(capsys, "expected options that can be read, got: News the option is odd; landscape demo --help")
 
 
 def test_the_help_has_every_command_once_in_groups_and_theirs_an_example_within_60_lines(capsys, monkeypatch):

@@ -157,19 +157,19 @@ def test_without_lpips_the_metric_is_null_in_the_record_and_the_help_says_how_to
     monkeypatch.setitem(sys.modules, "lpips", None)
     assert train(original, tmp_path / "run") == 0
     said = capsys.readouterr().out
-    assert "LPIPS" not in said
+    assert "LPIPS" not in said and "AVGE" not in said
     with pytest.raises(SystemExit):
         main(["train", "--help"])
-    assert "pip install 'splat-landscape[lpips]'" in " ".join(capsys.readouterr().out.split())
+    assert "pip install 'splat-landscape[lpips]'" in capsys.readouterr().out.splitlines()[-1]
     for part in (metrics(tmp_path / "run")[key] for key in ("train", "test")):
-        assert part["lpips"] is None and all(view["lpips"] is None for view in part["views"].values())
+        assert all(each["lpips"] is each["avge"] is None for each in (part, *part["views"].values()))
 
 
 @pytest.mark.usefixtures("lpips")
-def test_with_lpips_it_stands_beside_psnr_and_ssim(original, tmp_path, capsys):
+def test_with_lpips_it_stands_beside_psnr_and_ssim_with_its_network_and_avge(original, tmp_path, capsys):
     assert train(original, tmp_path / "run") == 0
     said, scores = capsys.readouterr().out, metrics(tmp_path / "run")
-    assert "LPIPS" in said and "left out" not in said
+    assert "LPIPS (VGG)" in said and "AVGE" in said and "left out" not in said
     with_lpips = scores["test"]["views"]
     for view in load_scene(original).load(list(with_lpips)):
         name = view.name.removeprefix("images/")
@@ -177,7 +177,7 @@ def test_with_lpips_it_stands_beside_psnr_and_ssim(original, tmp_path, capsys):
             pixels = torch.from_numpy(np.array(file)).permute(2, 0, 1) / 255
         wanted = float((pixels - view.image).abs().mean())
         assert with_lpips[view.name]["lpips"] == pytest.approx(wanted, abs=0.5 / 255)
-        assert f"{with_lpips[view.name]['lpips']:.4f}" in said
+        assert f"{with_lpips[view.name]['lpips']:.4f}" in said and f"{with_lpips[view.name]['avge']:.4f}" in said
 
 
 def test_scores_are_taken_inside_masks_where_there_are_any(original, tmp_path, capsys):
