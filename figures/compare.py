@@ -41,7 +41,7 @@ ACROSS = 3  # panels in a row
 WIDTH = 5.0  # inches for the panels of a row
 END: dict[str, Any] = {"linestyle": (0, (2, 2)), "linewidth": 0.6}
 ALONE: dict[str, Any] = {"linewidth": 0.4, "alpha": 0.5, "zorder": 1}
-ENDS_ALONE = "the density found none;\nthe ends alone are known"
+ENDS_ALONE = "the density found none; known\nare the extreme eigenvalues"
 BEHIND = {"color": "white", "pad": 1.0}
 TALLEST = 3.0  # inches of a panel
 

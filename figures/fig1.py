@@ -102,9 +102,9 @@ def _caption(names: Sequence[str], landscapes: Sequence[Plane]) -> str:
     first, second = (each.x.curvature for each in landscapes)
     way = "flatter" if second < first else "steeper"
     return (
-        f"The loss around the ends of {names[0]} and {names[1]} along their two steepest directions, in the window that both "
-        f"slices reach: {names[1]} is the {way} one (largest eigenvalue {rough(second)}, {names[0]} {rough(first)}), where the "
-        "paper has StableGS flatter. One training each, which decides no difference."
+        f"The loss around the last checkpoints of {names[0]} and {names[1]} along their two steepest directions, in the window "
+        f"that both slices reach: {names[1]} is the {way} one (largest eigenvalue {rough(second)}, {names[0]} {rough(first)}), "
+        "where the paper has StableGS flatter. One training each, which decides no difference."
     )
 
 

@@ -50,13 +50,13 @@ def draw(runs: Sequence[Path]) -> Figure:
             {name: {"color": each} for name, each in zip(names, RUNS, strict=False)},
             "eigenvalue_ratio",
         )
-        title = "Anisotropy index, one training each\n(no renders confirm its ends)"
+        title = "Anisotropy index, one training each\n(no renders confirm its eigenvalues)"
         index.set(xlabel="step", ylabel="|λ max / λ min|", title=title)
         index.xaxis.set_major_locator(step_ticks())
         index.grid(True)
         drawn = [surface(figure, (2, 3, 2 + i), end, scale, f"{names[i]}, end") for i, end in enumerate(ends)]
         figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], **BAR)
-        title = f"{BEGINNING} of {names[0]},\n{rough(wide.reach / scale.reach)} times the steps of the ends"
+        title = f"{BEGINNING} of {names[0]},\n{rough(wide.reach / scale.reach)} times the steps at the last checkpoints"
         around, colours = surface(figure, (2, 3, 4), start, wide, title)
         figure.colorbar(colours, ax=around, **BAR)
         for axis, direction in enumerate(("e₁", "e₂")):

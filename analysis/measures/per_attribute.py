@@ -269,7 +269,7 @@ def _fitted(objective: SceneObjective, options: PerAttributeOptions, notes: list
     basis = basis_within(settings.eigen, room)
     if basis < settings.eigen.basis:
         notes.append(
-            f"the families' Lanczos kept {basis} vectors instead of {settings.eigen.basis}, to stay within memory"
+            f"the searches by attribute kept {basis} vectors instead of {settings.eigen.basis}, to stay within memory"
         )
     batch = max(1, min(settings.batch, room // settings.steps))  # a run of the density keeps a vector a step
     return replace(settings, eigen=replace(settings.eigen, basis=basis), batch=batch)

@@ -229,8 +229,8 @@ def _ends(at: _Point, kept: Kept, generator: torch.Generator, report: Progress, 
     basis = basis_within(eigen, vectors_within(at.objective, memory))
     if basis < eigen.basis:
         notes.append(
-            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB and half of "
-            "what was free"
+            f"the search for extreme eigenvalues kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB "
+            "and half of what was free"
         )
     start = BlockEigenvectors(at.objective, *at.objective.approximate_blocks).warm_start()
     eigen = replace(eigen, max_seconds=kept.left, basis=basis)

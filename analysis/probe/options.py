@@ -36,7 +36,7 @@ class ProbeOptions:
     density_products: int | None = None
     """Of the spectral density; more narrow the brackets of sums.  Default: 108."""
     end_products: int | None = None
-    """At most, of the search for both ends.  Default: 3000."""
+    """At most, of the search for the extreme eigenvalues.  Default: 3000."""
     slice_points: int | None = None
     """Along each side of the slice, odd, 5 or more.
     Default: 41, with --quick 21."""

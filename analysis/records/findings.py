@@ -140,7 +140,7 @@ def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
 
     Their residual bounds the distance to an eigenvalue, not to the end of the spectrum.
     """
-    text = "The search for the {} eigenvalue ended at its {}: the end may lie farther out."
+    text = "The search for the {} eigenvalue ended at its {}: it may lie farther out."
     spent = {end: reason for end, reason in reasons.items() if reason and reason.endswith("budget")}
     return [Line(text.format(END_NAMES[end], reason), "caution") for end, reason in spent.items()]
 
@@ -177,7 +177,7 @@ def remedy(data: ProbeRecord, name: str) -> str:
     if name in ("top_mass", "participation_ratio"):
         products = int((made.fingerprint.question if made.fingerprint else {}).get("settings.density_matvecs") or 108)
         return f"a longer density narrows it: {_with(command, '--density-products', 4 * products)}"
-    return "the end is within its error of 0, and no more products resolve it"
+    return "the smallest eigenvalue is within its error of 0, and no more products resolve it"
 
 
 def _without(command: str, option: str) -> str:

@@ -35,7 +35,7 @@ ENDS = {
 }
 NEEDS_DENSITY = "needs the spectral density, which was left out"  # note of an index
 OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
-ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
+ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not always the extreme one."
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
 LEAST = 0.005  # share of an attribute in an eigenvector that is told
 GAPS, NUMBER, REMARK = 8, 27, 22  # of the probe's table: between columns, widest number in a line, least room for words

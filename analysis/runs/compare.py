@@ -41,7 +41,7 @@ ASKED = ("settings.", "seed", "objective.of")  # of the question: cautions have 
 PICTURES = {
     "compare_traces": "Traces by attribute, with their intervals. Filled: positive; open: negative; crossed: not decided.",
     "compare_densities": "How many directions are at least so curved, down (left) and up (right). Thin: each start "
-    "vector's quadrature alone: where these lie apart, its few steps do not decide. Dashed: the ends found.",
+    "vector's quadrature alone: where these lie apart, its few steps do not decide. Dashed: the extreme eigenvalues.",
     "compare_slices": "The plane of the two steepest directions of each run, in the window that all have, the same colours.",
     "compare_sections": "The loss along the two steepest directions of each run, in units of the parameters.",
 }

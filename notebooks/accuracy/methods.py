@@ -68,7 +68,7 @@ def diagonal_methods() -> Iterator[Method]:
         origin: Origin = "default" if (probes, estimate) == (32, chosen_diagonal) else "own"
         run = partial(_diagonal, probes=probes, estimate=estimate)
         yield Method("diagonal", name, f"{probes} probes", run, origin)
-    yield Method("diagonal", "own blocks, no coupling", "one pass", _diagonal_of_blocks, applies=is_scene)
+    yield Method("diagonal", "own blocks, pixels alone", "one pass", _diagonal_of_blocks, applies=is_scene)
 
 
 def _diagonal(

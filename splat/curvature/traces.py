@@ -167,7 +167,7 @@ def sampled_traces(
         for trace, x, y in zip(unfinished, *(part.unbind(dim=1) for part in sampled), strict=True):
             trace.add(x, y, late=seconds > trace.settings.max_seconds)
         if progress:
-            state = f"traces: {count + batch} samples of the coupling between pixels"
+            state = f"traces: {count + batch} random samples of what pairs of pixels add"
             progress(count + batch, unfinished[0].most, state)
     return {trace.name: trace.estimate() for trace in traces}
 

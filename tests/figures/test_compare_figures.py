@@ -74,7 +74,7 @@ def test_a_side_of_which_only_ends_are_known_says_so(tmp_path):
     record.arrays["spectrum"]["nodes"] = np.abs(record.arrays["spectrum"]["nodes"])
     figure = draw_densities({"one": record})
     said = [[text.get_text() for text in axes.texts] for axes in figure.axes]
-    assert said == [["the density found none;\nthe ends alone are known"], []]
+    assert said == [["the density found none; known\nare the extreme eigenvalues"], []]
     unresolved = unresolved_share(record.arrays["spectrum"])
     said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert said == ["one", "end of the spectrum", unresolved] and unresolved.startswith("not resolved from 0: ")

@@ -92,7 +92,9 @@ def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
     assert len(ends) == 1
     wide = Scale.of(start_of(runs[0]))
     assert (
-        surfaces[2].get_title().startswith(f"start of 3dgs,\n{rough(wide.reach / reach)} times the steps of the ends\n")
+        surfaces[2]
+        .get_title()
+        .startswith(f"start of 3dgs,\n{rough(wide.reach / reach)} times the steps at the last checkpoints\n")
     )
     assert surfaces[2].get_xlim()[1] == pytest.approx(wide.reach / 10.0**wide.steps)
     across, along = figure.axes[-2:]

@@ -119,27 +119,27 @@ def test_products_with_a_block_are_those_of_the_whole(matrix):
 
 
 def test_an_exact_method_has_no_error_and_says_so(pixels_alone):
-    (method,) = by_name("traces", "exact pass, sampled coupling", "default")
+    (method,) = by_name("traces", "exact pass, pixel pairs sampled", "default")
     runs = measure(pixels_alone, method, 0)
     assert {run.part for run in runs} == set(pixels_alone.operator.blocks)
     # float32 products against float64: independent roundings of what is added up
     assert all(run.true_error < 10 * pixels_alone.round_off and run.reported_error == 0 for run in runs)
     assert runs[0].matvecs == PASS
-    (diagonal,) = by_name("diagonal", "own blocks, no coupling")
+    (diagonal,) = by_name("diagonal", "own blocks, pixels alone")
     assert measure(pixels_alone, diagonal, 0)[0].true_error < 10 * pixels_alone.round_off
 
 
 def test_the_default_for_the_ends_of_a_scene_begins_at_its_own_blocks(with_ssim, matrix):
     (default,) = (m for m in own_methods() if m.quantity == "ends" and m.origin == "default" and m.applies(with_ssim))
     (other,) = (m for m in own_methods() if m.quantity == "ends" and m.origin == "default" and m.applies(matrix))
-    assert (default.name, other.name) == ("led by own blocks", "Lanczos, both ends")
+    assert (default.name, other.name) == ("led by own blocks", "Lanczos, both extremes")
     largest, smallest = measure(with_ssim, default, 0)
     assert largest.true_error < 1e-3 and smallest.true_error < 1e-3
     assert largest.matvecs % 1 == pytest.approx(PASS % 1)  # whole products, and a pass over the pixels
 
 
 def test_sampled_coupling_is_charged_by_its_jacobian_products(with_ssim):
-    method = next(m for m in by_name("traces", "exact pass, sampled coupling") if m.settings == "8 samples")
+    method = next(m for m in by_name("traces", "exact pass, pixel pairs sampled") if m.settings == "8 samples")
     assert measure(with_ssim, method, 0)[0].matvecs == pytest.approx(2 * PASS + 8 * 5 * JACOBIAN)
 
 
@@ -330,7 +330,7 @@ def test_a_setting_counts_with_the_largest_error_of_the_costlier_ones():
 @pytest.fixture
 def small(monkeypatch, matrix):
     monkeypatch.setattr(accuracy, "chosen_cases", lambda names, scenes: [matrix])
-    chosen = {"chosen by its probes", "Hutch++", "Lanczos, both ends"}
+    chosen = {"chosen by its probes", "Hutch++", "Lanczos, both extremes"}
     monkeypatch.setattr(accuracy, "own_methods", lambda: (m for m in own_methods() if m.name in chosen))
     monkeypatch.setattr(accuracy, "peer_methods", lambda: (list(scipy_methods()), ["curvlinops is left out (why)"]))
 

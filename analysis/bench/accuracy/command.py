@@ -138,7 +138,7 @@ def _exact(text: str, settings: TraceSettings, origin: Origin = "own") -> Method
         operator.charge(passes * PASS + JACOBIAN * sum(x.matvecs for x in found.values()))
         return _trace_answers(found)
 
-    return Method("traces", "exact pass, sampled coupling", text, run, origin, is_scene)
+    return Method("traces", "exact pass, pixel pairs sampled", text, run, origin, is_scene)
 
 
 def _trace_answers(found: Mapping[str, TraceEstimate]) -> list[Answer]:
@@ -149,7 +149,7 @@ def lanczos(text: str, settings: EigenSettings, origin: Origin = "own", applies:
     def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         return end_answers(extreme_eigenpairs(operator, generator(seed), settings))
 
-    name = "Lanczos, both ends"
+    name = "Lanczos, both extremes"
     return Method("ends", name if settings.block == 1 else f"{name}, in blocks", text, run, origin, applies)
 
 

@@ -69,7 +69,7 @@ def measured_fields(
         about, vectors = recorded.data.eigenvalues, recorded.arrays["eigenvectors"]
         known = {
             "e1": ("largest", about.max, "the steepest direction"),
-            "e_min": ("smallest", about.min, "the other end"),
+            "e_min": ("smallest", about.min, "the flattest direction"),
         }
         for name, (group, end, title) in known.items():
             if group in vectors and vectors[group].shape[1] and end.value:

@@ -41,7 +41,7 @@ PICTURES = {
     "set of visible ones is not the checkpoint's; dashed: the quadratic model.",
     "surface": "The same plane as a surface.",
     "spectrum": "The density of the spectrum, broadened; the share of all directions and of all curvature below a value; the "
-    "eigenvalues that the search for the ends met, each with the residual within which a true one lies.",
+    "eigenvalues that the search for the extreme ones met, each with the residual within which a true one lies.",
     "places": "Each position along two axes of the scene, in the colour of the largest curvature of its own block.",
     "traces": "The trace of each attribute's block of the Hessian, in units of its own: the rows do not compare.",
 }

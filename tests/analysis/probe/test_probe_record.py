@@ -123,7 +123,7 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
         assert f"trace of {label}" in said.out
     for label in ("largest eigenvalue", "smallest eigenvalue", "eigenvalue ratio", "negative ratio", "symmetry"):
         assert label in said.out
-    assert "participation ratio" not in said.out and "not necessarily the end" in " ".join(said.out.split())
+    assert "participation ratio" not in said.out and "not always the extreme one" in " ".join(said.out.split())
     assert str(run / "probe-quick" / "report.html") in said.out and "probe.json" in said.out
     for stage in ("traces", "eigenvalues", "slice"):
         assert stage in said.err
