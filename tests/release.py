@@ -1,8 +1,8 @@
 """A release, tried as its users get it: `make test-release`, minutes.
 
 A wheel is built and installed into a new environment, which otherwise has the packages of this one; there, in an empty folder,
-the demonstration, every command and Python block of the README and the pages, and the examples of all docstrings run.  The
-scene is the demonstration's, at few steps.
+the demonstration, every block of code of the README and the pages (but `make` and the activation of an environment), and the
+examples of all docstrings run.  The scene is the demonstration's, at few steps.  Of a clone there are the notebooks alone.
 """
 
 import re
@@ -15,22 +15,22 @@ from tempfile import mkdtemp
 
 ROOT = Path(__file__).resolve().parents[1]
 BUILD = ROOT / "build"
-PAGES = (
-    "README",
-    "docs/first-probe",
-    "docs/map-and-view",
-    "docs/python",
-    "docs/uses",
-    "docs/methods",
-    "docs/other-tools",
-)
-SHORT = {"train": ["--iterations", "20"], "probe": ["--quick"], "view": ["--html", "view.html"]}  # which end them soon
-BLOCK = re.compile(r"^```python\n(.*?)^```|^    (landscape [^\n]*)$", re.M | re.S)
+PACKAGES, DATA = ("landscape", "splat", "analysis", "figures"), ("*.jinja", "*.pyi", "*.csv", "py.typed")
+SHORT = {  # what ends them soon
+    "train": ["--iterations", "20"],
+    "probe": ["--quick"],
+    "slice": ["--points", "11"],
+    "view": ["--html", "view.html"],
+    "notebooks.renderer": ["--part", "products", "--each", "1"],
+}
+BLOCK = re.compile(r"^```(?:python|toml)\n(.*?)^```|^    ((?:landscape|pip install|python -m) [^\n]*)$", re.M | re.S)
+OFFLINE = ["--quiet", "--no-deps", "--no-index"]
 
 
 def main() -> None:
     """CalledProcessError at the first thing that fails."""
-    binaries, trials = environment(BUILD / "release"), Path(mkdtemp(prefix="release-"))
+    site, trials = environment(BUILD / "release"), Path(mkdtemp(prefix="release-"))
+    binaries = BUILD / "release" / "bin"
 
     def run(*words: object) -> None:
         print("$", shlex.join(map(str, words)), flush=True)
@@ -42,15 +42,18 @@ def main() -> None:
     run("landscape", "demo", "--out", "demo")
     for file in ("point_cloud.ply", "theirs/point_cloud.ply"):
         run("landscape", "convert", "demo/run", file)
-    for page in PAGES:
-        for code, command in BLOCK.findall((ROOT / f"{page}.md").read_text(encoding="utf-8")):
-            if code:
+    (trials / "notebooks").symlink_to(ROOT / "notebooks")
+    (trials / "balls.xyzrgb").write_text("0 0 0 1 0 0\n0.2 0 0 0 1 0\n")
+    (trials / "clipped").mkdir()
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        for code, command in BLOCK.findall(page.read_text(encoding="utf-8")):
+            if file := re.match(r"# (\S+\.\w+)\n", code):  # of the package that a page makes
+                (trials / "clipped" / file[1]).write_text(code, encoding="utf-8")
+            elif code:
                 run("python", "-c", code)
             elif words := shortened(command, trials):
-                run("landscape", *words)
-    packages = [
-        next((BUILD / "release").glob(f"lib/*/*/{name}")) for name in ("landscape", "splat", "analysis", "figures")
-    ]
+                run(*words)
+    packages = [site / name for name in PACKAGES]
     run(
         "python",
         "-m",
@@ -65,26 +68,33 @@ def main() -> None:
 
 
 def environment(folder: Path) -> Path:
-    """The programs of a new environment with the wheel, which finds the packages of this one, but not this checkout."""
+    """The packages of a new environment with the wheel, all of it, which finds those of this one, but not this checkout."""
     words = ["wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir"]
     subprocess.run([sys.executable, "-m", "pip", *words, BUILD / "wheel", ROOT], check=True)
     wheel = max((BUILD / "wheel").glob("*.whl"), key=lambda path: path.stat().st_mtime)
     venv.EnvBuilder(clear=True).create(folder)
     others = [path for path in sys.path if path.endswith("site-packages")]  # of folders named so no .pth is read
-    (next(folder.glob("lib/*/site-packages")) / "others.pth").write_text("\n".join(others))
-    words = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
-    subprocess.run([folder / "bin/python", *words, wheel], check=True)
-    return folder / "bin"
+    site = next(folder.glob("lib/*/site-packages"))
+    (site / "others.pth").write_text("\n".join(others))
+    subprocess.run([folder / "bin/python", "-m", "pip", "install", *OFFLINE, wheel], check=True)
+    data = [path.relative_to(ROOT) for name in PACKAGES for kind in DATA for path in (ROOT / name).rglob(kind)]
+    lacking = [path for path in data if not (site / path).is_file()]
+    assert data and not lacking and [*site.glob("splat_landscape-*.dist-info/**/CITATION.cff")], lacking
+    return site
 
 
 def shortened(line: str, trials: Path) -> list[str]:
-    """The words of a page's command, for the demonstration's scene; none for a run that another page has made."""
-    command, *words = shlex.split(line.replace("SCENE", "demo/scene"), comments=True)[1:]
-    if command == "train" and "--out" not in words:
+    """A page's command, for the demonstration's scene; none for a run that another page has made."""
+    words = shlex.split(re.sub("SCENE|data/fern", "demo/scene", line), comments=True)
+    if words[0] == "pip":
+        return ["python", "-m", *words, *OFFLINE, "--no-build-isolation"]
+    name = words[2 if words[0] == "python" else 1]
+    if name == "train" and "--out" not in words:
         words += ["--out", mkdtemp(dir=trials) + "/run"]
     if "--out" in words and (trials / words[words.index("--out") + 1]).exists():
         return []
-    return [command, *words, *SHORT.get(command, [])]
+    more = SHORT.get(name, [])
+    return words if {*more} & {*words} else [*words, *more]
 
 
 if __name__ == "__main__":
