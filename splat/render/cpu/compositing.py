@@ -1,4 +1,18 @@
-"""The compositing kernels of first order: `forward` front to back, `backward` back to front (`render/formulas.py`)."""
+"""The compositing kernels of first order: `forward` renders front to back, `backward` differentiates back to front.
+
+The formulas stand in `render/formulas.py`, with alpha, w, T, R, s and beta as they are named here; tiles, intersections and
+the arrays in `tile.py`.  A kernel's thread takes tile after tile, and of each tile splat after splat; it keeps what each
+pixel has so far in `state`, row by row.
+
+L        lanes: the pixels of a tile's row, which are one vector
+e, k     an intersection: its place in all lists, and its number in its tile, 0 in front
+u, v     whitened offset of a pixel from the splat's mean: u is the same in all rows of a tile, v follows by `row_v`
+terms    what gives v and log2 alpha of any row of the tile (`tile.alpha_terms`)
+top, bottom   the first row that the splat touches, and one past the last
+b, p     where a row begins: in `state`, and in a plane of the picture
+T        transmittance, of each pixel; from the splat on that stops a pixel, -T is kept: its sign says "stopped"
+v_...    cotangent: the loss's derivative in what follows
+"""
 
 import numpy as np
 
@@ -37,7 +51,7 @@ from splat.render.formulas import SPLAT, alpha_row, behind_all, plus, step_back
 
 @kernel
 def forward(counter, params, lists, frame, pixels):
-    """Render: fill `pixels`.  A row's T is negative once a pixel has stopped."""
+    """Render: fill `pixels` with colour, alpha, the final T and the number of the splat that stops each pixel."""
     L = lanes(params)
     state = scratch(params, FORWARD * L * TILE_ROWS)
     tile = next_tile(counter, lists)
@@ -67,7 +81,7 @@ def forward(counter, params, lists, frame, pixels):
 
 @formula
 def composite(params, lists, e, k, x0, y0, frame, state):
-    """Composite intersection e; True if it stopped a pixel."""
+    """Composite intersection e, number k of its tile; True if it stopped a pixel."""
     L = lanes(params)
     _splat, _u, terms, colour, _index, top, bottom = intersection(params, lists, e, k, x0, y0)
     stopped = False
@@ -92,7 +106,8 @@ def composite(params, lists, e, k, x0, y0, frame, state):
 
 @formula
 def end_row(state, b, L, frame, pixels, p):
-    """Add the background to a row, and write it."""
+    """Add the background to a row, and write its colour, alpha, final T and stops at p of each plane."""
+    # the final T, of stopped pixels too
     last = maximum(load(state, b + T * L), -load(state, b + T * L))
     store(pixels.transmittance, p, last)
     store(pixels.stop, p, load(state, b + STOP * L))
@@ -103,6 +118,7 @@ def end_row(state, b, L, frame, pixels, p):
 
 @formula
 def all_stopped(state, L):
+    """Whether no pixel of the tile has a positive T."""
     for y in range(TILE_ROWS):
         if any_lane(load(state, (FORWARD * y + T) * L) > 0.0):
             return False
@@ -114,7 +130,10 @@ def all_stopped(state, L):
 
 @kernel
 def backward(counter, params, lists, frame, pixels, v_planes, sums):
-    """The nine sums of every intersection from the cotangent of the planes."""
+    """The loss's derivative in every splat, tile by tile: from that in the planes, the nine sums of every intersection.
+
+    v_planes: derivatives in red, green, blue and alpha of each pixel.  sums: six moments of s, then three sums of w v_image.
+    """
     L = lanes(params)
     state = scratch(params, BACKWARD * L * TILE_ROWS)
     tile = next_tile(counter, lists)
@@ -139,6 +158,7 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
 
 @formula
 def begin_backward_row(state, b, L, frame, pixels, v_planes, p):
+    """Start a row behind all splats: the final T, where it stopped, R of the background, v_image."""
     last, v_pixel = load(pixels.transmittance, p), load_cotangent(v_planes, p, frame.size)
     store(state, b + T * L, last)
     store(state, b + STOP * L, load(pixels.stop, p))
@@ -148,7 +168,7 @@ def begin_backward_row(state, b, L, frame, pixels, v_planes, p):
 
 @formula
 def differentiate(params, lists, e, k, x0, y0, frame, state, sums):
-    """Undo intersection e, and write its sums."""
+    """Step in front of intersection e in each row, and write its sums."""
     L = lanes(params)
     _splat, u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
     moments = no_moments(params)
@@ -158,11 +178,11 @@ def differentiate(params, lists, e, k, x0, y0, frame, state, sums):
         # alpha as in `forward`
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
         R, v_image = load(state, b + REST * L), load3(state, b + GRAD * L, L)
-        # T and R in front of the splat; s = dL/dq, 0 where the cap holds
+        # T and R in front of the splat; s, the derivative in ln alpha, is 0 where the cap holds (alpha at least `free`)
         before, rest, w, beta, _r, we = step_back(alpha, load(state, b + T * L), R, v_image, colour)
-        s = select(uncapped <= frame.free, we - beta * R, 0.0)
+        s = select(uncapped <= frame.free, we - beta * R, 0.0)  # we: w (v_image . c)
         store(state, b + T * L, before)
         store(state, b + REST * L, rest)
-        # sums of s v^k and of w v_image over the rows; the columns follow once for all
+        # add s, s v, s v^2 and w v_image to the sums over rows; sums over columns, with their u, come once, at the end
         moments = add_row(moments, v, s, w, v_image)
     store_moments(sums, np.int64(lists.accumulator[e]), moments, u)

@@ -1,10 +1,10 @@
 """The arrays of the compositing kernels on the CPU, and how a tile of them is read and written.
 
 A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  An intersection is a splat in a tile.  Each writes
-its nine sums to an accumulator of its own, and those of a splat lie side by side, so that no sum depends on the order in which
-threads finish.  Every kernel (`compositing.py`, `tangents.py`, `blocks.py`) takes tiles from a counter until none is left
-(`threads.over_tiles`).  Arrays are flat: `params` holds PARAMS floats a splat, `tangents` K x SPLAT floats a splat, a plane
-stride x height floats.
+its nine sums (six moments of s, three of colour: `render/formulas.py`) to an accumulator of its own, and those of a splat lie
+side by side, so that no sum depends on the order in which threads finish.  Every kernel (`compositing.py`, `tangents.py`,
+`blocks.py`) takes tiles from a counter until none is left (`threads.over_tiles`).  Arrays are flat: `params` holds PARAMS
+floats a splat, `tangents` K x SPLAT floats a splat, a plane stride x height floats.
 """
 
 from typing import NamedTuple
@@ -37,7 +37,7 @@ MX, MX_REST, MY, MY_REST, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE
 # The vectors that a kernel keeps of a row of pixels, in this order; a number is the first of its channels.
 T, STOP = 0, 1  # transmittance, and the index of the intersection at which a pixel stops
 IMAGE, FORWARD = 2, 5
-REST, GRAD, BACKWARD = 2, 3, 6  # R and v_image
+REST, GRAD, BACKWARD = 2, 3, 6  # R (not to be taken for the _REST of a rounded number) and v_image
 BEHIND, UNDO = 2, 5  # the colour behind, of the passes in `blocks.py` and `footprints.py`
 DT, DIMAGE, TANGENT = 0, 1, 4  # after T and STOP, for each of K tangents
 TAU, DREST, DGRAD, BACKWARD_TANGENT = 0, 1, 2, 5  # after those of `backward`, for each of K tangents
@@ -229,17 +229,19 @@ def clear_sums(lists, first, count, width, sums):
 
 @formula
 def no_moments(params):
+    """Sums over rows before the first: of s, s v, s v^2, and of w h for three channels."""
     zero = broadcast(params, 0.0)
     return zero, zero, zero, zero, zero, zero
 
 
 @formula
 def add_row(m, v, s, w, h):
-    """The sums over rows, with a row more."""
+    """The sums over rows m with one row more, of s at v and of w h."""
     t = row_terms(v, s, w, h)
     return m[0] + t[0], m[1] + t[1], m[2] + t[2], m[3] + t[3], m[4] + t[4], m[5] + t[5]
 
 
 @formula
 def store_moments(sums, accumulator, moments, u):
+    """Sum over the columns, with their u, and write a splat's nine sums of this tile."""
     store_sums(sums, accumulator * SPLAT, column_terms(moments, u))

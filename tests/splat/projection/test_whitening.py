@@ -1,10 +1,22 @@
 """Whitened coordinates: splats are round in them, and what is carried there and back is what it was."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from splat.projection.whitening import LOG2_E, plain, plain_adjoint, whitened, whitened_adjoint, whitening
+from splat.backend.cpu.jit import kernel
+from splat.projection import whitening as formulas
+from splat.projection.whitening import LOG2_E
 
+_formulas: list[Any] = [
+    formulas.plain,
+    formulas.plain_adjoint,
+    formulas.whitened,
+    formulas.whitened_adjoint,
+    formulas.whitening,
+]
+plain, plain_adjoint, whitened, whitened_adjoint, whitening = [kernel(each.py_func) for each in _formulas]
 EPS = np.finfo(np.float64).eps
 ANGLES = np.linspace(0.05, 3.05, 7)
 AXES = [(1.0, 1.0), (0.7, 30.0), (0.55, 500.0)]  # px

@@ -11,6 +11,7 @@ import triton.language as tl
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false
 # (in a kernel names mean tensors)
 from splat.backend.cpu.dual import exp, select, sqrt, value_of
+from splat.backend.cpu.jit import kernel
 from splat.gpu.language import formula
 from splat.gpu.language.compile import jit
 from splat.gpu.language.formula import Number, tangent_of, triton_formula, variable
@@ -62,10 +63,10 @@ def test_comparisons_choices_and_whole_numbers_are_those_of_python(device):
     splats *= torch.tensor([40.0, 30.0, 0.02, 0.01, 0.02, 1.2])  # some too faint, some not bounded by an ellipse
     first, last = (torch.empty(16, dtype=torch.int32, device=device) for _ in range(2))
     list_rows[(1,)](splats.to(device), first, last, 16, BLOCK=16, TILE=16)
+    ellipse_alone, rows_alone = kernel(formulas.ellipse_of.py_func), kernel(formulas.rows_of_strip.py_func)
     expected = []
     for i, splat in enumerate(splats.numpy()):
-        ellipse = formulas.ellipse_of(splat, 0.1, 3.0)
-        expected.append(formulas.rows_of_strip(splat, ellipse, i % 3, 16, 40, 30))
+        expected.append(rows_alone(splat, ellipse_alone(splat, 0.1, 3.0), i % 3, 16, 40, 30))
     assert list(zip(first.tolist(), last.tolist(), strict=True)) == expected
     assert len(set(expected)) > 3
 
