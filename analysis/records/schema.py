@@ -48,7 +48,7 @@ class Objective(Struct, kw_only=True):
     background: tuple[float, float, float] | None = None
     operator: Operator | None = None
     value: Number = None
-    gradient_norm: NonNegative | None = None
+    gradient_norm: Number = None
     views_error: Maybe[Number] = UNSET
 
 
@@ -64,7 +64,7 @@ class TraceOf(Struct, kw_only=True):
     """
 
     value: Number
-    standard_error: NonNegative | None
+    standard_error: Number
     low: Number = None
     high: Number = None
     confidence: Number = None
@@ -130,7 +130,7 @@ class End(Struct, kw_only=True):
     """
 
     value: Number
-    residual: NonNegative | None
+    residual: Number
     vector_error: Number = None
     reason: str | None = None
     note: Maybe[str] = UNSET
@@ -405,18 +405,16 @@ class Direction(Struct, kw_only=True):
 class Slice(Struct, kw_only=True):
     """The loss along a line or over a plane through the checkpoint.
 
-    cosine: of the angle between the two directions before they were orthogonalised.  center_loss: L at the centre, rendered
-    with the slice.  points, evaluated_points, crossed_points: of the grid, see ARRAYS; evaluations: renders of all views.
-    Errors are shares of the range of the evaluated losses.  tolerance: asked of interpolated points; None where all are
-    evaluated.  resolved: whether it was reached; else only evaluated points have a loss.  interpolation_error: bound at every
-    interpolated point (`landscape.slices.interpolation`); 0 where all are evaluated, None where there is no bound.
-    error_seen: the largest at `holdout_points` random points; share_beyond: with 95% confidence at most this share of the
-    interpolated points has a larger error.  reason: as for `Trace`.
+    center_loss: L at the centre, rendered with the slice.  points, evaluated_points, crossed_points: of the grid, see ARRAYS;
+    evaluations: renders of all views.  Errors are shares of the range of the evaluated losses.  tolerance: asked of
+    interpolated points; None where all are evaluated.  resolved: whether it was reached; else only evaluated points have a
+    loss.  interpolation_error: bound at every interpolated point (`landscape.slices.interpolation`); 0 where all are evaluated,
+    None where there is no bound.  error_seen: the largest at `holdout_points` random points; share_beyond: with 95% confidence
+    at most this share of the interpolated points has a larger error.  reason: as for `Trace`.
     """
 
     directions: Annotated[list[Direction], Meta(min_length=1, max_length=2)]
     loss_scale: float
-    cosine: Maybe[Number] = UNSET
     points: Count = 0
     evaluated_points: Count | None = None
     crossed_points: Count = 0
