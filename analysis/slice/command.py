@@ -35,7 +35,7 @@ from analysis.records.provenance import provenance_of, require_seed
 from analysis.records.quantities import apart, measured, quantity
 from analysis.records.records import SliceRecord, record_folder, recorded_probe, require_replaceable
 from analysis.records.schema import FiniteProbe
-from analysis.slice.directions import Direction, Shape, at_right_angles, axis_of, cosine, find_directions
+from analysis.slice.directions import Direction, Shape, axis_of, find_directions
 from analysis.slice.options import SliceOptions
 from analysis.slice.record import Found, slice_arrays, slice_record
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
@@ -167,9 +167,8 @@ def _measure(
     hessian = SceneHessian(objective, keep_null=True)  # a line may have components in the null space
     true = CountingOperator(hessian)
     with stages.stage("directions") as report:
-        exact = find_directions(shape, objective, operator, others, known, generators, report)
-        _keep_eigenvectors(exact, unfinished)
-        directions = at_right_angles(exact)
+        directions = find_directions(shape, objective, operator, others, known, generators, report)
+        _keep_eigenvectors(directions, unfinished)
         vectors = torch.stack([direction.vector for direction in directions], dim=1)
         curvatures = (vectors.double() * true.apply(vectors).double()).sum(dim=0).tolist()
     loss_scale = RISE * objective.loss(center)
@@ -186,13 +185,13 @@ def _measure(
         )
     probe = None
     if shape.dimension == 1:
-        reach = 1.0 if shape.kinds[0] == "line" else float(axes[0][-1])
+        reach = 1.0 if shape.kind == "line" else float(axes[0][-1])
         with stages.stage("finite steps") as report:
             steps = [reach * step for step in DECADES]
             probe = finite_probe(_evaluation(objective, 1), center, vectors[:, 0], true, steps, report)
     by_view = None if population is None else hessian.by_view(vectors)
     matvecs = operator.matvecs + true.matvecs
-    return Found(found, probe, directions, vectors, cosine(exact), loss_scale, matvecs, population, by_view)
+    return Found(found, probe, directions, vectors, loss_scale, matvecs, population, by_view)
 
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:

@@ -9,13 +9,12 @@
 
     curvature unit  sqrt(2 rise L / |d.H d|): the step within which the curvature alone changes the loss by rise L
 
-Of two kinds in one plane the second (then e₁⊥, say) is its part at a right angle to the first, drawn out to its old length.
 Eigenvectors that are known already are taken where H itself confirms them: |H v - lambda v| within the tolerance, lambda
 falling.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Float64
@@ -41,62 +40,46 @@ from splat.curvature.objective import SceneObjective
 
 SHARE = 0.001  # default radii: as a share of the parameters' sizes, ...
 BEYOND = 0.5  # ... beyond a line's ends
-PLANES = {"eigenvectors", "random"}  # kinds that are two directions, where no other is named
+PLANES = ("eigenvectors", "random")  # kinds that are two directions
 RTOL, MAX_MATVECS = 1e-3, 300  # of the eigenvectors
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Directions to slice along: one or two kinds of directions, in how many dimensions, a radius for each or none."""
+    """Directions to slice along: of which kind, in how many dimensions, a radius for each or none."""
 
-    kinds: tuple[Along, ...]
+    kind: Along
     dimension: int
     radii: tuple[float | None, ...]
 
     @classmethod
     def of(
-        cls, along: Sequence[Along], dimension: int | None, radii: Sequence[float], points: int, others: int
+        cls, along: Along | None, dimension: int | None, radii: Sequence[float], points: int, others: int
     ) -> "Shape":
         """The shape that was asked for; ValueError where the wishes contradict each other."""
-        if twice := [kind for kind in dict.fromkeys(along) if along.count(kind) > 1]:
-            raise InputError(
-                f"expected directions of different kinds, got --along {twice[0]} twice; leave one out, and for a plane of one "
-                "kind, eigenvectors or random, give --dimension 2"
-            )
-        default: Along = "line" if others else "eigenvectors"
-        named = list(along) or [default]
-        kinds: tuple[Along, ...] = tuple(sorted(named, key=lambda kind: kind != "line"))  # a line keeps its ends
-        if len(kinds) > 2:
-            raise InputError(f"expected one or two directions, got {' and '.join(kinds)}; slice again for the others")
-        if ("line" in kinds) != bool(others):
-            given = "one more checkpoint; add --along line" if others else "no other checkpoint; name it"
+        kind = along or ("line" if others else "eigenvectors")
+        if (kind == "line") != bool(others):
+            given = "one more checkpoint; leave out --along" if others else "no other checkpoint; name it"
             raise InputError(f"expected two checkpoints for a line and one otherwise, got {given}")
-        if others > 2 or (others == 2 and len(kinds) == 2):
-            raise InputError(
-                f"expected at most three checkpoints, for the plane through them alone, got {1 + others} along "
-                f"{' and '.join(kinds)}; leave one out"
-            )
-        most = 2 if len(kinds) == 2 or set(kinds) <= PLANES or others == 2 else 1
+        if others > 2:
+            raise InputError(f"expected at most three checkpoints, for the plane through them, got {1 + others}")
+        most = 2 if kind in PLANES or others == 2 else 1
         wanted = most if dimension is None else dimension
         if others == 2 and wanted == 1:
             raise InputError(
                 "expected two checkpoints for a line, got three, which span a plane; leave out one, or --dimension"
             )
-        if wanted > most or (wanted == 1 and len(kinds) == 2):
-            advice = "give --along once" if wanted == 1 else "give --along twice"
-            raise InputError(f"expected directions for dimension {wanted}, got {' and '.join(kinds)}; {advice}")
+        if wanted > most:
+            raise InputError(f"expected one dimension of {kind}, got {wanted}; planes are along {' and '.join(PLANES)}")
         if len(radii) > wanted or any(not 0 < radius < float("inf") for radius in radii):
             raise InputError(f"expected at most {wanted} radii, finite and above 0, got {list(radii)}")
         symmetric_axis(1.0, points)  # says what is wrong with their number
         each = radii if len(radii) == wanted else [*radii, *radii, None, None][:wanted]
-        return cls(kinds, wanted, tuple(each))
+        return cls(kind, wanted, tuple(each))
 
     @property
     def name(self) -> str:
-        return f"{'-'.join(self.kinds)}-{self.dimension}d"
-
-    def kind(self, axis: int) -> Along:
-        return self.kinds[min(axis, len(self.kinds) - 1)]
+        return f"{self.kind}-{self.dimension}d"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,43 +103,20 @@ def find_directions(
     report: Progress,
 ) -> list[Direction]:
     """The directions of a shape.  others: where lines end; known: eigenvectors to try before they are computed."""
-    center, found = objective.active.flat, []
-    for kind in shape.kinds:
-        count = shape.dimension if len(shape.kinds) == 1 else 1
-        if kind == "eigenvectors":
-            vectors, residuals = largest_eigenvectors(operator, count, known, generators[kind], report)
-            found += [Direction(kind, f"e{'₁₂'[i]}", vectors[:, i], residuals[i]) for i in range(count)]
-        elif kind == "random":
-            groups = groups_of(objective.blocks, len(objective.active), center.numel())
-            vectors = random_directions(center, groups, generators[kind], count)
-            scale = "share of the size"
-            found += [Direction(kind, f"r{'₁₂'[i]}", vectors[:, i], scale=scale) for i in range(count)]
-        elif kind == "gradient":
-            found.append(Direction(kind, "gradient", gradient_direction(objective.gradient)[:, 0]))
-        else:
-            vectors = torch.cat([line_between(center, other) for other in others], dim=1)
-            orthonormal(vectors)  # refuses three checkpoints on one line
-            names = ["line"] if len(others) == 1 else ["line₁", "line₂"]
-            found += [Direction(kind, name, vectors[:, i], scale="share of the way") for i, name in enumerate(names)]
-    return found
-
-
-def at_right_angles(found: Sequence[Direction]) -> list[Direction]:
-    """The directions of a slice: those found, but of two kinds the second's part at a right angle to the first, as long."""
-    if len({direction.kind for direction in found}) < 2:
-        return list(found)
-    first, second = found
-    across = orthonormal(torch.stack([first.vector, second.vector], dim=1))[:, 1]
-    length = torch.linalg.vector_norm(second.vector.double()).to(across.dtype)
-    return [first, replace(second, name=f"{second.name}⊥", vector=across * length, residual=None)]
-
-
-def cosine(directions: Sequence[Direction]) -> float | None:
-    """Cosine of the angle between two directions as they are found."""
-    if len(directions) < 2:
-        return None
-    unit = [direction.vector.double() / direction.vector.double().norm() for direction in directions]
-    return float(torch.dot(*unit))
+    center, kind, count = objective.active.flat, shape.kind, shape.dimension
+    if kind == "eigenvectors":
+        vectors, residuals = largest_eigenvectors(operator, count, known, generators[kind], report)
+        return [Direction(kind, f"e{'₁₂'[i]}", vectors[:, i], residuals[i]) for i in range(count)]
+    if kind == "random":
+        groups = groups_of(objective.blocks, len(objective.active), center.numel())
+        vectors = random_directions(center, groups, generators[kind], count)
+        return [Direction(kind, f"r{'₁₂'[i]}", vectors[:, i], scale="share of the size") for i in range(count)]
+    if kind == "gradient":
+        return [Direction(kind, "gradient", gradient_direction(objective.gradient)[:, 0])]
+    vectors = torch.cat([line_between(center, other) for other in others], dim=1)
+    orthonormal(vectors)  # refuses three checkpoints on one line
+    names = ["line"] if len(others) == 1 else ["line₁", "line₂"]
+    return [Direction(kind, name, vectors[:, i], scale="share of the way") for i, name in enumerate(names)]
 
 
 def axis_of(kind: Along, radius: float | None, points: int, curvature: float, rise: float) -> Float64[Tensor, " _"]:

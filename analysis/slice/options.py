@@ -23,8 +23,8 @@ class SliceOptions:
     checkpoint: CheckpointPath
     others: Annotated[Positional[tuple[Path, ...]], arg(metavar="[OTHER [THIRD]]", help_behavior_hint="")] = ()
     """Where a line leads to: a checkpoint with as many Gaussians and the same SH degree.  Two: the plane through all three."""
-    along: Annotated[UseAppendAction[tuple[Along, ...]], arg(metavar="NAME", help_behavior_hint="")] = ()
-    """Directions; given twice, the plane of the first direction of each.  Default: eigenvectors, or line where OTHER is given.
+    along: Annotated[Along | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Directions.  Default: eigenvectors, or line where OTHER is given.
     eigenvectors: of the two largest eigenvalues, from RUN/probe or else computed.
     random: filter-normalised, in each attribute of each Gaussian as long as that attribute is.
     gradient: the steepest ascent.  line: to OTHER."""

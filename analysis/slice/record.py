@@ -20,7 +20,7 @@ from splat.curvature.objective import SceneObjective
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A slice and its directions, also as columns.  probe: the finite steps of a line; cosine: see `schema.Slice`.
+    """A slice and its directions, also as columns.  probe: the finite steps of a line.
 
     population: the training's views, where fewer are measured; by_view: then the curvatures in each of these.
     """
@@ -29,7 +29,6 @@ class Found:
     probe: FiniteProbe | None
     directions: list[Direction]
     vectors: Float[Tensor, "n d"]
-    cosine: float | None
     loss_scale: float
     matvecs: int
     population: int | None = None
@@ -68,7 +67,7 @@ def slice_record(found: Found, objective: SceneObjective, notes: list[str], made
     if found.population is not None and found.by_view is not None:
         for direction, curvatures in zip(directions, found.by_view.T, strict=True):
             direction.views_error = sampling_error(curvatures, found.population)
-    about = {"directions": directions, "loss_scale": found.loss_scale, "cosine": found.cosine, **grid.record()}
+    about = {"directions": directions, "loss_scale": found.loss_scale, **grid.record()}
     evaluations = grid.evaluations + (0 if probe is None else probe.evaluations)
     return SliceRecord(
         objective=objective_of(objective, grid.center_loss, float(objective.gradient.double().norm())),
