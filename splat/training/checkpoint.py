@@ -144,7 +144,7 @@ def open_subject(path: str | Path, foreign: Foreign = Foreign(), out: Path | Non
     >>> open_subject("nowhere/fern")
     Traceback (most recent call last):
         ...
-    FileNotFoundError: expected a checkpoint written by landscape train at nowhere/fern, found no such file
+    FileNotFoundError: expected a checkpoint written by landscape train at nowhere/fern, found no such file; name ...
     """
     path = Path(path)
     path = inside if (inside := path / FILE).is_file() else path
@@ -177,7 +177,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     >>> load_checkpoint("nowhere/checkpoint.pt")
     Traceback (most recent call last):
         ...
-    FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file
+    FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file; name ...
     """
     path = Path(path)
     if not path.is_file():
@@ -196,7 +196,7 @@ def _instead(path: Path) -> str:
     if not path.exists():
         near = path.parent if path.name == FILE else path
         beside = [each.name for each in near.parent.iterdir()] if near.parent.is_dir() else []
-        return f"no such file{did_you_mean(near.name, beside)}"
+        return f"no such file{did_you_mean(near.name, beside) or '; name a run, or a file of Gaussians'}"
     if (inside := path / FILE).is_file():
         return f"a folder; name the {inside} in it"
     if runs := sorted(path.glob("*/checkpoint.pt")):

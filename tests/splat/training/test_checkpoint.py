@@ -85,8 +85,8 @@ def refused(path: Path, message: str) -> ValueError:
 
 
 def test_a_missing_file_is_reported(tmp_path):
-    with pytest.raises(FileNotFoundError, match="found no such file"):
-        load_checkpoint(tmp_path / "checkpoint.pt")
+    with pytest.raises(FileNotFoundError, match="found no such file; name a run, or a file of Gaussians"):
+        load_checkpoint(tmp_path / "none" / "checkpoint.pt")
 
 
 PLY = b"ply\nformat binary_little_endian 1.0\n"
