@@ -1,6 +1,7 @@
 """Results: eigenpairs of one end of a spectrum, and of both ends, with residuals that bound their errors."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -36,6 +37,10 @@ class Eigenpairs:
         """[value - residual, value + residual] of the pair at this index.  It contains an eigenvalue of H."""
         value, residual = float(self.values[index]), float(self.residuals[index])
         return value - residual, value + residual
+
+    def columns(self, name: str) -> dict[str, Any]:
+        """Of the outermost pair, as `TraceEstimate.columns`."""
+        return {name: float(self.values[0]), f"{name}_error": float(self.residuals[0]), f"{name}_reason": self.reason}
 
     def record(self, index: int = 0) -> dict[str, Number | str]:
         columns = {"value": self.values, "residual": self.residuals, "vector_error": self.vector_errors}

@@ -7,13 +7,12 @@ An operator H has n rows (`dim`), named ranges of rows (`blocks`; for a scene on
     RestrictedOperator  E^T H E     one block, E its rows of the identity
     ScaledOperator      D H D       a change of units: the curvature in theta / d, D = diag(d)
     ProjectedOperator   P H P       P an orthogonal projector, to remove a known null space
-    CountingOperator    H           counts vectors, calls and seconds
+    CountingOperator    H           counts vectors
 
 An operator that wraps another one has the same rows, blocks and dtype unless stated otherwise.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from time import perf_counter
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -89,13 +88,6 @@ def products(operator: SymmetricOperator, V: Float[Tensor, "n k"], batch: int) -
         if vectors.shape[1]:
             part.copy_(product(operator, vectors.contiguous()))
     return result
-
-
-def finished(tensor: Tensor) -> Tensor:
-    """The tensor, after waiting for it: a call that starts work on a GPU returns before the work is done."""
-    if tensor.is_cuda:
-        torch.cuda.synchronize(tensor.device)
-    return tensor
 
 
 def require_blocks(blocks: Mapping[str, slice], n: int) -> dict[str, slice]:
@@ -249,21 +241,14 @@ class LiftedOperator:
 
 
 class CountingOperator:
-    """H, with counts of its use so far.
-
-    matvecs: vectors that it was applied to.  calls: of `apply`.  seconds: duration of these calls, with the work of a GPU.
-    """
+    """H, with a count of its use: matvecs, the vectors that it was applied to so far."""
 
     def __init__(self, inner: SymmetricOperator) -> None:
         self.inner = inner
         self.dim, self.dtype, self.blocks = inner.dim, inner.dtype, inner.blocks
-        self.matvecs, self.calls, self.seconds = 0, 0, 0.0
+        self.matvecs = 0
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(finished(V), self.dim, self.dtype)
-        start = perf_counter()
-        result = finished(self.inner.apply(V))
-        self.seconds += perf_counter() - start
+        result = self.inner.apply(V)
         self.matvecs += V.shape[1]
-        self.calls += 1
         return result

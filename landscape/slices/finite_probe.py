@@ -29,6 +29,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.linalg import column_lengths
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.results import Progress, ShortRepr, plain
 from landscape.slices.grid_evaluations import Loss
@@ -110,7 +111,9 @@ def finite_probe(
     >>> found.infinitesimal, found.curvatures, found.truncation
     (12.0, tensor([12.0200, 14.0000], dtype=torch.float64), tensor([0.0200, 2.0000], dtype=torch.float64))
     """
-    _require_probe(center, direction, steps, noise_points)
+    if len(steps) < 2 or not (steps[0] > 0 and all(a < b for a, b in pairwise(steps)) and isfinite(steps[-1])):
+        raise ValueError(f"expected two or more positive steps that increase, got {tuple(steps)}")
+    column_lengths(direction[:, None], "directions")
     origin, v = center.detach().double(), direction.detach().double()
     total = 2 * len(steps) + 1 + noise_points
     at = _Line(loss, origin, v, center.dtype, total, progress)
@@ -195,17 +198,3 @@ def _truncation(steps: Tensor, curvatures: Tensor) -> Tensor:
     squares = steps.square()
     slopes = (curvatures.diff() / squares.diff()).abs()
     return torch.cat([slopes, slopes[-1:]]) * squares
-
-
-def _require_probe(center: Tensor, direction: Tensor, steps: Sequence[float], noise_points: int) -> None:
-    if noise_points <= ORDER:
-        raise ValueError(f"expected more than {ORDER} noise points, got {noise_points}")
-    if center.ndim != 1 or center.shape != direction.shape:
-        raise ValueError(
-            f"expected a flat center and a direction of its length, got {tuple(center.shape)} and {tuple(direction.shape)}"
-        )
-    if not (torch.isfinite(direction).all() and direction.any()):
-        raise ValueError("expected a finite direction that is not zero, got another")
-    increasing = all(a < b for a, b in pairwise(steps))
-    if len(steps) < 2 or not (increasing and steps[0] > 0 and isfinite(steps[-1])):
-        raise ValueError(f"expected two or more positive steps that increase, got {tuple(steps)}")

@@ -83,8 +83,11 @@ def evaluate_slice(
     >>> bowl.loss[20, ::10], bowl.loss.shape, int(bowl.evaluated.sum()), bowl.reason
     (tensor([4., 1., 0., 1., 4.], dtype=torch.float64), torch.Size([41, 41]), 161, 'tolerance')
     """
-    _require_slice(center, directions, coordinates)
-    _require_model(gradient, operator, directions)
+    if not all(axis.isfinite().all() and (axis.diff() > 0).all() for axis in coordinates):
+        raise ValueError("expected finite coordinates that increase, got others; sort them and drop repeated ones")
+    if (gradient is None) != (operator is None):
+        raise ValueError("expected both gradient and operator for the quadratic model, or neither; got one of them")
+    column_lengths(directions, "directions")
     _require_refinable(coordinates, settings, generator)
     axes = [axis.detach().double() for axis in coordinates]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
@@ -138,38 +141,6 @@ def _derivatives(
         return slope, operator.double().cpu()
     curvature = (spans.T @ product(operator, directions.to(operator.dtype)).double()).cpu()
     return slope, (curvature + curvature.T) / 2
-
-
-def _require_model(
-    gradient: Tensor | None, operator: SymmetricOperator | Float64[Tensor, "d d"] | None, directions: Tensor
-) -> None:
-    if (gradient is None) != (operator is None):
-        raise ValueError("expected both gradient and operator for the quadratic model, or neither; got one of them")
-    n, d = directions.shape
-    for name, given, shape in (("gradient", gradient, (n,)), ("E^T H E", operator, (d, d))):
-        if not isinstance(given, Tensor):
-            continue
-        if given.shape != shape:
-            raise ValueError(f"expected {name} of shape {shape} for the quadratic model, got {tuple(given.shape)}")
-        if not torch.isfinite(given).all():
-            raise InputError(f"expected finite {name} for the quadratic model, got NaN or infinity")
-
-
-def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Tensor]) -> None:
-    n = center.numel()
-    if center.ndim != 1 or directions.ndim != 2 or directions.shape[0] != n or directions.shape[1] not in (1, 2):
-        raise ValueError(
-            f"expected a flat center (n,) and one or two directions (n, d), got {tuple(center.shape)} and "
-            f"{tuple(directions.shape)}"
-        )
-    if len(coordinates) != directions.shape[1] or any(axis.ndim != 1 or axis.numel() == 0 for axis in coordinates):
-        raise ValueError(
-            f"expected one vector of coordinates per direction ({directions.shape[1]}), got shapes "
-            f"{[tuple(axis.shape) for axis in coordinates]}"
-        )
-    if not all(axis.isfinite().all() and (axis.diff() > 0).all() for axis in coordinates):
-        raise ValueError("expected finite coordinates that increase, got others; sort them and drop repeated ones")
-    column_lengths(directions, "directions")
 
 
 def _require_refinable(

@@ -26,7 +26,7 @@ from landscape.traces.pixels import gauss_newton_traces
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 INDICES = ("eigenvalue_ratio", "negative_ratio", "top_mass", "participation_ratio")
 COLUMNS = (
-    "step", "gaussians", "state", "note", "seconds", "time_share", "visible_gaussians", "parameters", "matvecs",
+    "step", "gaussians", "state", "note", "seconds", "visible_gaussians", "parameters", "matvecs",
     *(f"trace_{name}{key}" for name in ATTRIBUTES for key in ("", "_error", "_low", "_high", "_dim", "_reason")),
     *(f"lambda_{end}{key}" for end in ("max", "min") for key in ("", "_error", "_reason")),
     *(f"{index}{key}" for index in INDICES for key in ("", "_low", "_high")),
@@ -52,7 +52,6 @@ class Monitor:
         if self.path.exists():
             raise InputError(f"expected a folder without a trajectory, got {self.path}; name another one")
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.begun, self.spent = perf_counter(), 0.0
 
     def __call__(self, step: int, hessian: RendererHessian | Callable[[], RendererHessian]) -> bool:
         """Record this step where it is one of those; returns whether it was.
@@ -70,9 +69,6 @@ class Monitor:
         except InputError as error:
             row["note"] = str(error)
         row["seconds"] = perf_counter() - start
-        self.spent += row["seconds"]
-        trained = perf_counter() - self.begun - self.spent
-        row["time_share"] = self.spent / trained if trained > 0 else None
         self.rows.append(row)
         self._write()
         return True
@@ -81,14 +77,11 @@ class Monitor:
         generator = torch.Generator(hessian.parameters.device).manual_seed(self.seed + step)
         row: dict[str, Any] = {}
         for name, found in gauss_newton_traces(hessian, generator, self.samples).items():
-            numbers = {"": found.value, "_error": found.standard_error, "_low": found.low, "_high": found.high}
-            row |= {f"trace_{name}{key}": value for key, value in numbers.items()}
-            row |= {f"trace_{name}_dim": found.dim, f"trace_{name}_reason": found.reason}
+            row |= found.columns(f"trace_{name}")
         ends = renderer_eigenpairs(hessian, generator, self.eigen)
-        for name, pairs in {"lambda_max": ends.largest, "lambda_min": ends.smallest}.items():
-            row |= {name: float(pairs.values[0]), f"{name}_error": float(pairs.residuals[0])}
-            row[f"{name}_reason"] = pairs.reason
-        return row | {"matvecs": ends.matvecs}
+        return (
+            row | ends.largest.columns("lambda_max") | ends.smallest.columns("lambda_min") | {"matvecs": ends.matvecs}
+        )
 
     def _write(self) -> None:
         """Write all rows to a file beside the table, then put it in its place."""

@@ -74,5 +74,10 @@ class TraceEstimate:
             return "positive"
         return "negative" if self.high < 0 else "undetermined"
 
+    def columns(self, name: str) -> dict[str, Any]:
+        """Columns of a table with a row for each step of a training: NAME, NAME_error, ..."""
+        numbers = {"": self.value, "_error": self.standard_error, "_low": self.low, "_high": self.high}
+        return {f"{name}{key}": each for key, each in (numbers | {"_dim": self.dim, "_reason": self.reason}).items()}
+
     def record(self) -> dict[str, Any]:
         return plain(self, "value standard_error low high confidence sign dim probes matvecs reason method")

@@ -14,7 +14,7 @@ the entries z_i^T S z_j of its Gram matrix, summed over views, and with them the
 """
 
 from collections.abc import Iterator
-from math import ceil, sqrt
+from math import ceil
 from typing import NamedTuple
 
 import torch
@@ -26,7 +26,7 @@ from landscape.linalg import gram
 from landscape.operators.operator import require_finite
 from landscape.operators.renderer.renderer import LinearView, RendererHessian
 from landscape.probes import draw_probes
-from landscape.traces.diagonal import DiagonalEstimate
+from landscape.traces.diagonal import DiagonalEstimate, mean_diagonal
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.hutchinson import GROUP, LEAST
 from landscape.traces.quadratic import FEWEST, PowerSums, mean_interval, power_sums
@@ -93,8 +93,7 @@ def gauss_newton_diagonal(hessian: RendererHessian, generator: torch.Generator, 
     found = torch.zeros(hessian.dim, samples, dtype=torch.float64, device=hessian.parameters.device)
     for U, C in _sampled(hessian, generator, samples):
         found += U.double() * C.double() / len(hessian.views)
-    errors = found.std(dim=1) / sqrt(samples)
-    return DiagonalEstimate(found.mean(dim=1), errors, found, hessian.blocks, samples, "pixels")
+    return mean_diagonal(found, hessian, samples, "pixels")
 
 
 def gauss_newton_blocks(

@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from math import isfinite, nan, sqrt
+from math import isfinite, sqrt
 from typing import Any
 
 import torch
@@ -34,7 +34,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.linalg import column_lengths, gram
+from landscape.linalg import column_lengths
 from landscape.operators.operator import require_finite, require_vectors
 from landscape.operators.renderer.parameters import Parameters
 from landscape.results import ShortRepr
@@ -54,7 +54,6 @@ class ProductErrors(ShortRepr):
     least its own size when h doubles; those of rounding and jumps differ at random.
     noise: of the difference of two equal products, over sqrt(2); 0 for a renderer that repeats itself.
     kinks: share of |J v|^2 in pixels whose one-sided differences disagree.
-    asymmetry: rms |u . H v - v . H u| / (|u| |v|) over pairs of the vectors; nan for a single one.
 
     J^T, from the renderer's own backward pass, is taken as exact: `check_renderer` compares it with J.
     """
@@ -62,7 +61,6 @@ class ProductErrors(ShortRepr):
     step: Float64[Tensor, " k"]
     noise: Float64[Tensor, " k"]
     kinks: Float64[Tensor, " k"]
-    asymmetry: float
 
     @property
     def total(self) -> Float64[Tensor, " k"]:
@@ -188,7 +186,7 @@ class RendererHessian:
 
     def measured(self, V: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n k"], ProductErrors]:
         """H V and its errors."""
-        lengths = column_lengths(V, "vectors")
+        column_lengths(V, "vectors")
         HV, kinks, _ = self.products(V)
         once = HV.double()
         longer = torch.linalg.vector_norm(once - self.products(V, factor=2.0)[0], dim=0)
@@ -196,8 +194,7 @@ class RendererHessian:
         if self.noise:
             noise = torch.linalg.vector_norm(once - self.products(V)[0], dim=0) / sqrt(2)
         require_finite(self, bool(torch.isfinite(longer + noise).all()))
-        forms, pairs = gram(V, once) / lengths[:, None] / lengths, len(lengths) * (len(lengths) - 1)
-        return HV, ProductErrors(longer, noise, kinks, float((forms - forms.T).norm()) / sqrt(pairs) if pairs else nan)
+        return HV, ProductErrors(longer, noise, kinks)
 
     def loss_at(self, theta: Float[Tensor, " n"]) -> Float64[Tensor, ""]:
         """The mean loss at other parameters, for slices and finite steps: one render of each view.

@@ -141,15 +141,12 @@ def test_progress_counts_the_evaluations():
 
 
 def test_bad_probes_are_refused():
-    misused("direction of its length", finite_probe, quartic, CENTER, V[:3], DenseOperator(A))
-    misused("direction that is not zero", finite_probe, quartic, CENTER, 0 * V, DenseOperator(A))
+    misused("directions that are not zero", finite_probe, quartic, CENTER, 0 * V, DenseOperator(A))
     for steps in ((1.0,), (0.0, 1.0), (1.0, 0.5)):
         misused("positive steps that increase", probed, quartic, steps=steps)
     misused("finite objective at the centre", probed, lambda theta: float("nan"))
-    seen = []
-    with pytest.raises(ValueError, match=f"more than {ORDER} noise points, got {ORDER}"):
-        finite_probe(lambda theta: seen.append(theta) or 0.0, CENTER, V, DenseOperator(A), noise_points=ORDER)
-    assert not seen
+    with pytest.raises(ValueError, match=f"more than {ORDER} values, got {ORDER}"):
+        finite_probe(quartic, CENTER, V, DenseOperator(A), noise_points=ORDER)
 
 
 @pytest.mark.parametrize("rounded", [float, np.float32, lambda value: value.item()], ids=["float", "numpy", "item"])

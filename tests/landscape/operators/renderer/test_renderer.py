@@ -55,7 +55,6 @@ def test_the_error_in_float32_is_within_the_stated_one():
     errors, stated = (found - exact.apply(V)).norm(dim=0), single.error(V.float())
     assert (errors < stated.total).all()
     assert stated.total.norm() < 0.02 * found.norm()
-    assert stated.asymmetry < float(stated.total.max() / V.norm(dim=0).min())
 
 
 def test_a_product_with_several_vectors_is_that_with_each():
