@@ -190,7 +190,7 @@ def probe_settings(options: ProbeOptions) -> ProbeSettings:
     if options.end_products is not None:
         changes["eigen"] = replace(settings.eigen, max_matvecs=options.end_products)
     changes = {name: value for name, value in changes.items() if value is not None}
-    return replace(settings, slice_rise=options.slice_rise, **changes)
+    return replace(settings, **changes)
 
 
 def _family_options(options: ProbeOptions) -> "PerAttributeOptions | None":

@@ -40,8 +40,6 @@ class ProbeOptions:
     slice_points: int | None = None
     """Along each side of the slice, odd, 5 or more.
     Default: 41, with --quick 21."""
-    slice_rise: float = 0.001
-    """A curvature unit changes the loss by this share of it; the slice reaches 3 each way."""
     per_attribute: bool = False
     """Also anisotropy of all attributes and of each, by four times as many products as the rest, which --seconds
     does not end.  Not under torchrun."""

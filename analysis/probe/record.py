@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import isfinite, nan
+from math import isfinite
 
 import numpy as np
 from msgspec import UNSET, convert, structs
@@ -54,7 +54,7 @@ def probe_record(
             *_unreached(found),
             *left_out_note(objective.counts.views, left_out and left_out.population),
         ],
-        skipped=_skipped(found, objective, timing),
+        skipped=_skipped(found, objective),
         provenance=made,
         timing=dict(timing),
     )
@@ -244,33 +244,23 @@ def _counts(found: Measured, objective: SceneObjective) -> Counts:
     )
 
 
-def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, float]) -> dict[str, Skip]:
+def _skipped(found: Measured, objective: SceneObjective) -> dict[str, Skip]:
     """Work that products of the exact Hessian skip, over all views, and that estimators did not need.
 
-    The time that estimators saved is that of the same number of samples or renders that were computed.  Not counted: tiles
-    that a product on the GPU skips because its vectors change nothing in them.
+    Not counted: tiles that a product on the GPU skips because its vectors change nothing in them.
     """
     counts, probes = objective.counts, [trace.probes for trace in found.traces.values()]
-
-    products = {
+    skipped = {
         "gaussians_out_of_sight": counts.gaussians - counts.active_gaussians,
         "sh_bands_not_in_use": (counts.sh_degree + 1) ** 2 - (counts.active_sh_degree + 1) ** 2,
         "entries_behind_opaque_fronts": sum(view.intersections_behind for view in objective.linearized),
         "tiles_of_zero_cotangent": sum(view.dark_tiles for view in objective.linearized),
         "products_of_views_not_concerned": found.spared,
+        "samples_of_finished_traces": sum(max(probes) - count for count in probes),
     }
-
-    def undone(count: int, made: int, seconds: float) -> Skip:
-        return Skip(count=count, seconds_saved=count * seconds / made if made else nan)
-
-    skips = {name: Skip(count=count, seconds_saved=None) for name, count in products.items()}
-    samples = sum(max(probes) - count for count in probes)
-    skips["samples_of_finished_traces"] = undone(samples, sum(probes), timing["traces"])
     if found.plane is not None:
-        grid = found.plane.slice
-        predicted = grid.loss.numel() - int(grid.evaluated.sum())
-        skips["points_of_the_slice_predicted"] = undone(predicted, grid.evaluations, timing["slice"])
-    return skips
+        skipped["points_of_the_slice_predicted"] = int((~found.plane.slice.evaluated).sum())
+    return {name: Skip(count=count) for name, count in skipped.items()}
 
 
 def _checks(found: Measured, views: int) -> dict[str, Check]:

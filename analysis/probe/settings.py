@@ -56,8 +56,6 @@ class ProbeSettings:
             raise InputError(
                 f"expected an odd number of at least {FEWEST_POINTS} slice points, got {self.slice_points}"
             )
-        if not (self.slice_radius > 0 and self.slice_rise > 0):
-            raise InputError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
         if not self.memory > 0:
             raise InputError(f"expected memory > 0, got {self.memory}")
         if self.density_matvecs and self.density_matvecs < FEWEST_PRODUCTS:

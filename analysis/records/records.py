@@ -97,10 +97,9 @@ class Check(Struct, kw_only=True):
 
 
 class Skip(Struct, kw_only=True):
-    """Work that was not needed.  seconds_saved: estimated from the time of the work done; None where not known."""
+    """Work that was not needed."""
 
     count: Count
-    seconds_saved: Number
 
 
 Shapes = dict[str, dict[str, list[Count]]]

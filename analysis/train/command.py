@@ -301,7 +301,7 @@ def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, cons
         for done in spent.timed(train(training, run.views)):
             progress.after_step(done, spent)
             if trajectory:
-                trajectory.after_step(spent.wall)
+                trajectory.after_step()
             if done.step % LOOK == 0:
                 run.save_reached()
             stop = interrupted.is_set()

@@ -8,7 +8,6 @@ RUN/test/panels/NAME.png    side by side: photograph, render, and the error, whi
 
 import shlex
 from collections.abc import Sequence
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +45,11 @@ def report(training: Training, views: Sequence[View], held_out: Sequence[View], 
     config = training.config
     background = config.background_colour(training.gaussians.flat.dtype)
     renders, photographs = out / RENDERS, {view.name: view for view in held_out}
-    names = render_names(list(photographs))
 
     def keep(name: str, image: Tensor) -> None:
-        write_atomically(renders / names[name], png(bytes_of(image)))
-        write_atomically(renders / PANELS / names[name], png(panel(image, photographs[name])))
+        file = render_name(name)
+        write_atomically(renders / file, png(bytes_of(image)))
+        write_atomically(renders / PANELS / file, png(panel(image, photographs[name])))
 
     console = Console()
     try:
@@ -90,23 +89,6 @@ def render_name(view: str) -> str:
     its digest."""
     flat = Path(view.replace("/", "_"))
     return f"{short(flat.stem if flat.suffix.lower() in IMAGE_SUFFIXES else flat.name)}.png"
-
-
-def render_names(views: Sequence[str]) -> dict[str, str]:
-    """`render_name` of each view; those that would be one file, in any case of letters, are told apart by a number.
-
-    >>> render_names(["a/b.png", "a_b.png", "c"])
-    {'a/b.png': 'a_b.png', 'a_b.png': 'a_b-2.png', 'c': 'c.png'}
-    """
-    names: dict[str, str] = {}
-    for view in views:
-        name, taken = render_name(view), {each.lower() for each in names.values()}
-        stem = name.removesuffix(".png")
-        numbered = (f"{stem}-{number}.png" for number in count(2))
-        names[view] = (
-            name if name.lower() not in taken else next(each for each in numbered if each.lower() not in taken)
-        )
-    return names
 
 
 def panel(image: Float[Tensor, "3 h w"], view: View) -> UInt8[np.ndarray, "h w3 3"]:

@@ -17,7 +17,7 @@ Columns:
     step, gaussians        steps done, and Gaussians after them
     state, note            "whole"; "coarse": traces from a few samples, ends to 10% or COARSE_MATVECS products, no density;
                            "skipped": nothing could be measured, for the reason in the note
-    seconds, time_share    of the record; of all records so far over those of the steps so far
+    seconds                of the record
     visible_gaussians, parameters    Gaussians in sight, and active parameters
     matvecs                products H v of the record
     trace_A                of each attribute's block, with _error (standard error), _low, _high (95%), _dim and _reason
@@ -118,23 +118,22 @@ class Trajectory:
     def before_steps(self) -> None:
         """Record the start."""
         if self.training.step == 0 and not self.rows:
-            self._record(0.0)
+            self._record()
 
-    def after_step(self, trained: float) -> None:
-        """Record every so many steps and after the last.  trained: seconds of the steps so far."""
+    def after_step(self) -> None:
+        """Record every so many steps and after the last."""
         if self.training.step % self.settings.every == 0 or self.training.step == self.training.config.iterations:
-            self._record(trained)
+            self._record()
 
-    def _record(self, trained: float) -> None:
+    def _record(self) -> None:
         """Add a row and write all."""
-        spent, start = sum(row["seconds"] for row in self.rows), perf_counter()
+        start = perf_counter()
         row: Row = {"step": self.training.step, "gaussians": len(self.training.gaussians), "state": "skipped"}
         try:
             row |= self._measured()
         except InputError as error:  # such as no Gaussian in sight: the training may recover
             row["note"] = str(error)
         row["seconds"] = perf_counter() - start
-        row["time_share"] = (spent + row["seconds"]) / trained if trained else None
         row |= self._about()
         self.rows.append(row)
         # dtype object keeps integers in a column with gaps, as they are in rows that were read
@@ -198,15 +197,8 @@ def measure(objective: SceneObjective, generator: torch.Generator, settings: Tra
 def _columns(found: Found) -> Row:
     row: Row = {}
     for name, trace in found.traces.items():
-        numbers = {"": trace.value, "_error": trace.standard_error, "_low": trace.low, "_high": trace.high}
-        row |= {f"trace_{name}{key}": value for key, value in numbers.items()}
-        row |= {f"trace_{name}_dim": trace.dim, f"trace_{name}_reason": trace.reason}
-    for name, pairs in {"lambda_max": found.ends.largest, "lambda_min": found.ends.smallest}.items():
-        row |= {
-            name: float(pairs.values[0]),
-            f"{name}_error": float(pairs.residuals[0]),
-            f"{name}_reason": pairs.reason,
-        }
+        row |= trace.columns(f"trace_{name}")
+    row |= found.ends.largest.columns("lambda_max") | found.ends.smallest.columns("lambda_min")
     for name, bracket in found.indices.record().items():
         assert isinstance(bracket, dict)
         row |= {name: bracket["value"], f"{name}_low": bracket["low"], f"{name}_high": bracket["high"]}
@@ -219,5 +211,4 @@ def _read_rows(path: Path, step: int) -> list[Row]:
         return []
     table, text = read_trajectory(path), read_table(path, dtype=str, na_filter=False)
     rows: list[Row] = [dict(zip(text, row, strict=True)) for row in text.itertuples(index=False)]
-    kept = zip(rows, table["step"], table["seconds"], strict=True)
-    return [row | {"seconds": float(seconds)} for row, at, seconds in kept if at <= step]
+    return [row for row, at in zip(rows, table["step"], strict=True) if at <= step]

@@ -41,8 +41,7 @@ from landscape.slices.slices import curvature_reach
 from landscape.traces.pixels import gauss_newton_blocks
 
 NAMED = re.compile(r"(.+\.py):([^\W\d]\w*)")
-USED = {"checkpoint", "out", "seed", "strict", "verbose", "quick", "density_products", "end_products"}
-USED |= {"slice_points", "slice_rise"}
+USED = {"checkpoint", "out", "seed", "strict", "verbose", "quick", "density_products", "end_products", "slice_points"}
 POSITIONS, HALVINGS = "means", 7  # of the step along an end that changes the loss by RISE
 
 

@@ -56,7 +56,7 @@ def test_the_record_has_counts_checks_stages_and_provenance(record, dense, run):
     assert all((record.folder / file).stat().st_size > 5000 for file in files)
 
 
-def test_what_was_skipped_is_counted_and_its_time_said(record, dense, run):
+def test_what_was_skipped_is_counted(record, dense, run):
     objective, _, _, _ = dense
     skipped, gaussians = record.data.skipped, load_checkpoint(run / "double.pt").training.gaussians
     views = list(objective.linearized)
@@ -70,9 +70,6 @@ def test_what_was_skipped_is_counted_and_its_time_said(record, dense, run):
         "samples_of_finished_traces": sum(most - trace.probes for trace in record.data.traces.values()),
         "points_of_the_slice_predicted": int((~record.arrays["slice"]["evaluated"]).sum()),
     }
-    undone = [skipped[name] for name in ("samples_of_finished_traces", "points_of_the_slice_predicted")]
-    assert all((skip.seconds_saved > 0) == (skip.count > 0) for skip in undone)
-    assert [skip.seconds_saved for skip in skipped.values()].count(None) == 5
 
 
 def test_a_checkpoint_can_be_probed_with_the_loss_of_3dgs(run, tmp_path, no_pictures):
@@ -93,7 +90,6 @@ def test_the_record_is_strict_json(record):
 def numbers(record: Record) -> tuple[dict, dict]:
     """All that may not differ between two runs."""
     data = {key: value for key, value in plain(record.data).items() if key not in ("timing", "provenance")}
-    data["skipped"] = {name: skip["count"] for name, skip in data["skipped"].items()}
     return data, {group: {k: v.tolist() for k, v in arrays.items()} for group, arrays in record.arrays.items()}
 
 
@@ -117,7 +113,6 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     assert data.anisotropy.top_mass.value is None and "density" not in data.timing
     assert "the spectral density was left out, and the indices that need it" in data.notes
     skips = data.skipped
-    assert skips["entries_behind_opaque_fronts"].seconds_saved is None
     assert skips["gaussians_out_of_sight"].count == data.counts.skipped_gaussians
     for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
         assert f"trace of {label}" in said.out
@@ -220,13 +215,7 @@ def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_pa
 
 
 def test_settings_out_of_range_are_refused():
-    for key, value in (
-        ("slice_points", 3),
-        ("slice_points", 6),
-        ("slice_rise", 0.0),
-        ("density_matvecs", 5),
-        ("memory", -1.0),
-    ):
+    for key, value in (("slice_points", 3), ("slice_points", 6), ("density_matvecs", 5), ("memory", -1.0)):
         wrong: dict = {key: value}
         with pytest.raises(ValueError, match="expected"):
             replace(ProbeSettings(), **wrong)

@@ -22,7 +22,7 @@ from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 
 STEPS, EVERY = 40, 10
-TIMES = ["seconds", "time_share"]
+TIMES = ["seconds"]
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_a_row_is_written_every_so_many_steps_with_every_column(run):
 def test_the_last_row_is_that_of_the_checkpoint(run, at_the_end, tmp_path):
     training, views, _, reference = at_the_end
     trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY), reference)
-    trajectory.after_step(1.0)
+    trajectory.after_step()
     written, (again,) = rows(run).iloc[-1], trajectory.rows
     assert {key: again[key] for key in again if key not in (*TIMES, "note")} == {
         key: written[key] for key in again if key not in (*TIMES, "note")
@@ -105,7 +105,7 @@ def test_a_row_is_the_landscape_within_its_errors(at_the_end, tmp_path):
     training, views, objective, reference = at_the_end
     few = replace(training, gaussians=training.gaussians.select(objective.mask.nonzero()[:15, 0]))
     trajectory = Trajectory(tmp_path, few, views, TrajectorySettings(EVERY), reference)
-    trajectory.after_step(1.0)
+    trajectory.after_step()
     (row,) = trajectory.rows
     config = training.config
     objective = SceneObjective(few.gaussians, views, config.loss, torch.zeros(3), config.render)
@@ -178,14 +178,14 @@ def test_a_record_of_which_nothing_can_be_measured_says_why_and_whole_numbers_st
 ):
     training, views, _, reference = at_the_end
     along = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY), reference)
-    along.after_step(1.0)
+    along.after_step()
     assert along.skipped == ""
 
     def refused(*_):
         raise InputError("expected Gaussians in sight")
 
     monkeypatch.setattr("analysis.train.trajectory.measure", refused)
-    along.after_step(2.0)
+    along.after_step()
     assert along.skipped == "of 2 records of the landscape 1 are empty: expected Gaussians in sight"
     table = pd.read_csv(tmp_path / "trajectory.csv", dtype=str)
     assert list(table["state"]) == ["whole", "skipped"] and table["visible_gaussians"].iloc[0].isdigit()
