@@ -16,8 +16,10 @@ from tempfile import mkdtemp
 ROOT = Path(__file__).resolve().parents[1]
 BUILD = ROOT / "build"
 PACKAGES, DATA = ("landscape", "splat", "analysis", "figures"), ("*.jinja", "*.pyi", "*.csv", "py.typed")
-SHORT = {  # what ends them soon
+SHORT = {  # what ends them soon, by the first of these words in them
+    "gn-cg": ["--iterations", "2"],
     "train": ["--iterations", "20"],
+    "--curve": ["--sample", "3"],
     "probe": ["--quick"],
     "slice": ["--points", "11"],
     "view": ["--html", "view.html"],
@@ -45,13 +47,13 @@ def main() -> None:
     (trials / "notebooks").symlink_to(ROOT / "notebooks")
     (trials / "balls.xyzrgb").write_text("0 0 0 1 0 0\n0.2 0 0 0 1 0\n")
     (trials / "clipped").mkdir()
+    tried: list[list[str]] = []  # pages share some
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         for code, command in BLOCK.findall(page.read_text(encoding="utf-8")):
             if file := re.match(r"# (\S+\.\w+)\n", code):  # of the package that a page makes
                 (trials / "clipped" / file[1]).write_text(code, encoding="utf-8")
-            elif code:
-                run("python", "-c", code)
-            elif words := shortened(command, trials):
+            elif (words := ["python", "-c", code] if code else shortened(command, trials)) and words not in tried:
+                tried.append(words)
                 run(*words)
     packages = [site / name for name in PACKAGES]
     run(
@@ -93,7 +95,7 @@ def shortened(line: str, trials: Path) -> list[str]:
         words += ["--out", mkdtemp(dir=trials) + "/run"]
     if "--out" in words and (trials / words[words.index("--out") + 1]).exists():
         return []
-    more = SHORT.get(name, [])
+    more = next((SHORT[word] for word in SHORT if word in words), [])
     return words if {*more} & {*words} else [*words, *more]
 
 
