@@ -12,13 +12,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.operators.operator import require_vectors
-from splat.backend.graphs import CudaGraphCache, CudaGraphs
 from splat.curvature.linearize import VECTORS
 from splat.curvature.null.active_spaces import Projector, projector_of
 from splat.curvature.objective import SceneObjective
-
-# bytes of workspace up to which products are recorded: above, kernels run for longer than it takes to launch them
-MOST_RECORDED = 1 << 28
 
 
 class ViewSum:
@@ -114,9 +110,7 @@ class SceneHessian:
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         require_vectors(V, self.dim, self.dtype)
-        PV = self._argument(V)
-        total = self._recordings(self.views.apply, PV) if self.recordable(V.shape[1]) else self.views.apply(PV)
-        return self.project(total / len(self.objective.views)).to(V.device)
+        return self.project(self.views.apply(self._argument(V)) / len(self.objective.views)).to(V.device)
 
     def _argument(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """Vectors with the same H V as P V, at less cost than P."""
@@ -126,14 +120,3 @@ class SceneHessian:
     def by_view(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:
         """v . P H_m P v of every view's part of H and each column: their mean over the views is v . P H P v."""
         return self.views.forms(self._argument(V))
-
-    def recordable(self, vectors: int) -> bool:
-        """Whether products with so many vectors are worth a CUDA graph: views are on a GPU, all kept, and small."""
-        if self.objective.active.flat.device.type != "cuda":
-            return False
-        views = self.objective.linearized
-        return views.kept == len(views) and views.workspace(vectors) <= MOST_RECORDED
-
-    @cached_property
-    def _recordings(self) -> CudaGraphCache:
-        return CudaGraphCache(CudaGraphs(self.objective.active.flat.device))

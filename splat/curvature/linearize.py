@@ -244,7 +244,3 @@ class KeptViews:
         if len(self._views) < self.kept:
             self._views[index] = view
         return view
-
-    def workspace(self, vectors: int) -> int:
-        """Bytes that a product with so many vectors takes in the first view, VECTORS at a time."""
-        return self.first.workspace(min(vectors, VECTORS))
