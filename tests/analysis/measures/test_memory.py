@@ -40,7 +40,7 @@ def test_what_a_view_takes_is_foreseen_from_its_raster(objective):
     rasters = [rasterize_view(active, view.camera, objective.background, objective.settings) for view in views]
     view, workspace, _ = max(LinearizedView.size_of(raster, active, objective.settings) for raster in rasters)
     assert needs_of(objective)[0] == view and 0.7 < view / kept.first.bytes < 1.5
-    assert 0.7 < workspace / kept.workspace(1) < 1.5
+    assert 0.7 < workspace / kept.first.workspace(1) < 1.5
 
 
 def test_less_memory_keeps_fewer_views_and_too_little_is_refused(objective, monkeypatch):

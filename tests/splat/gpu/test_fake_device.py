@@ -107,7 +107,7 @@ def test_products_of_a_scene_stay_on_the_device_and_do_not_wait(monkeypatch):
         fake.waits.clear()
         fake.brought.clear()
         hessian.apply(V)
-        assert not +fake.waits and not +fake.brought  # so that they can be recorded
+        assert not +fake.waits and not +fake.brought  # the host runs ahead
         _ = objective.gradient, objective.block_diagonal(approximate=True), objective.loss(flat), scene_units(objective)
         known = BlockEigenvectors(objective, *objective.approximate_blocks)
         known.steepest(1, 1)
