@@ -238,7 +238,6 @@ def _counts(found: Measured, objective: SceneObjective) -> Counts:
         objective.counts,
         found.left_out and found.left_out.population,
         rank=found.rank,
-        views_kept_linearised=objective.linearized.kept,
         products=found.matvecs,
         renders=evaluations * objective.counts.views,
     )

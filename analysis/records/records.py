@@ -73,16 +73,13 @@ class Counts(Struct, kw_only=True):
 
     gaussians: Count
     visible_gaussians: Count
-    skipped_gaussians: Count = 0
     parameters: Count
     active_parameters: Count
-    skipped_quaternion_lengths: Count = 0
     sh_degree_stored: Count
     sh_degree_active: Count
     views: Count
     views_of: Maybe[Count] = UNSET
     rank: Maybe[Count] = UNSET
-    views_kept_linearised: Maybe[Count] = UNSET
     products: Count = 0
     renders: Count = 0
 
@@ -369,10 +366,8 @@ def counts_of(active: "ActiveCounts", views_of: int | None, **work: int) -> Coun
     return Counts(
         gaussians=active.gaussians,
         visible_gaussians=active.active_gaussians,
-        skipped_gaussians=active.gaussians - active.active_gaussians,
         parameters=active.parameters,
         active_parameters=active.active_parameters,
-        skipped_quaternion_lengths=active.radial_quaternions,
         sh_degree_stored=active.sh_degree,
         sh_degree_active=active.active_sh_degree,
         views=active.views,

@@ -409,8 +409,7 @@ class Slice(Struct, kw_only=True):
     evaluations: renders of all views.  Errors are shares of the range of the evaluated losses.  tolerance: asked of
     interpolated points; None where all are evaluated.  resolved: whether it was reached; else only evaluated points have a
     loss.  interpolation_error: bound at every interpolated point (`landscape.slices.interpolation`); 0 where all are evaluated,
-    None where there is no bound.  error_seen: the largest at `holdout_points` random points; share_beyond: with 95% confidence
-    at most this share of the interpolated points has a larger error.  reason: as for `Trace`.
+    None where there is no bound.  error_seen: the largest at `holdout_points` random points.  reason: as for `Trace`.
     """
 
     directions: Annotated[list[Direction], Meta(min_length=1, max_length=2)]
@@ -425,7 +424,6 @@ class Slice(Struct, kw_only=True):
     interpolation_error: Number = 0.0
     error_seen: Maybe[Number] = UNSET
     holdout_points: Count = 0
-    share_beyond: Portion | None = None
     reason: str = ""
     note: Maybe[str] = UNSET
 

@@ -9,7 +9,7 @@ r(0, 0) is left free.
 
 The error of the interpolant is judged by its predictions at n points drawn at random from those that it does not know:
 
-    seen      the largest error among them.  With confidence 1 - c at most 1 - c^(1/n) of the other points are off by more
+    seen      the largest error among them
     bound     of the error at each of m other points.  The k errors beyond the quantile u at 15/16 are taken as exponential.
               Of these, with a sum S of their excesses, a further one exceeds u + z with probability (1 + z / S)^-k, so that all
               m stay below it with confidence 1 - c where z = S ((m / 16 c)^(1/k) - 1); at least what was seen.  A larger share
@@ -81,17 +81,6 @@ class PlaneInterpolant:
         return spline(self._places).reshape(r.shape)
 
 
-def share_beyond(judged: int, looks: int) -> float:
-    """Largest share of points off by more than what was seen at so many random ones, at the look of this number.
-
-    The k-th look has the confidence 1 - 0.05 / 2^k: several looks have more chances to be lucky.
-
-    >>> round(share_beyond(64, 1), 3)
-    0.056
-    """
-    return 1 - _chance(looks) ** (1 / judged) if judged else 1.0
-
-
 def error_bound(errors: np.ndarray, others: int, looks: int) -> float:
     """Bound of the error at every one of so many other points, from the errors at random ones; infinite without any.
 
@@ -106,9 +95,6 @@ def error_bound(errors: np.ndarray, others: int, looks: int) -> float:
     excess = errors[errors > threshold] - threshold
     if not excess.size:
         return float(errors.max())
-    rarer = max(TAIL * others / _chance(looks), 1.0) ** (1 / excess.size) - 1
+    chance = (1 - CONFIDENCE) / 2**looks  # several looks have more chances to be lucky
+    rarer = max(TAIL * others / chance, 1.0) ** (1 / excess.size) - 1
     return max(threshold + float(excess.sum()) * rarer, float(errors.max()))
-
-
-def _chance(looks: int) -> float:
-    return (1 - CONFIDENCE) / 2**looks

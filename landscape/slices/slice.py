@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from landscape.results import StopReason, plain
-from landscape.slices.interpolation import error_bound, share_beyond
+from landscape.slices.interpolation import error_bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +79,6 @@ class Slice:
             return 0.0
         return error / self.range if self.range else inf
 
-    @property
-    def share_beyond(self) -> float:
-        """The largest share of interpolated points with errors above error_seen, with 95% confidence."""
-        return 0.0 if self.evaluated.all() else share_beyond(self.holdout.numel(), self.looks)
-
     def arrays(self) -> dict[str, np.ndarray]:
         """x, y: coordinates (n,); of each point the loss, the model, whether it was evaluated, and in another smooth piece."""
         known = dict(zip("xy", self.coordinates, strict=False))
@@ -96,4 +91,4 @@ class Slice:
             "evaluated_points": int(self.evaluated.sum()),
             "crossed_points": 0 if self.discontinuous is None else int(self.discontinuous.sum()),
             "holdout_points": self.holdout.numel(),
-        } | plain(self, "evaluations center_loss tolerance resolved interpolation_error error_seen share_beyond reason")
+        } | plain(self, "evaluations center_loss tolerance resolved interpolation_error error_seen reason")

@@ -41,7 +41,6 @@ class ActiveCounts:
 
     active_gaussians: those that touch a pixel of some view; with keep_unseen all.  parameters: stored numbers of all Gaussians.
     active_parameters: those of the active ones in the SH bands in use, less one for the length of each quaternion.
-    radial_quaternions: number of such lengths.
     """
 
     gaussians: int
@@ -50,7 +49,6 @@ class ActiveCounts:
     active_parameters: int
     sh_degree: int
     active_sh_degree: int
-    radial_quaternions: int
     views: int
 
 
@@ -115,7 +113,7 @@ class SceneObjective:
             self._unseen = Regularizers(used.select(~self.mask), loss_settings, len(gaussians)).value
         n, given, kept = len(self.active), gaussians.flat.numel(), self.active.flat.numel()
         degrees = gaussians.sh_degree, self.active.sh_degree
-        self.counts = ActiveCounts(len(gaussians), n, given, kept - n, *degrees, n, len(views))
+        self.counts = ActiveCounts(len(gaussians), n, given, kept - n, *degrees, len(views))
 
     @property
     def couples_pixels(self) -> bool:

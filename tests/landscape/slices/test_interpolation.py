@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from landscape.slices.interpolation import PlaneInterpolant, error_bound, share_beyond
+from landscape.slices.interpolation import PlaneInterpolant, error_bound
 
 X, Y = np.linspace(-1, 1, 21), np.concatenate([np.linspace(-0.3, 0, 7), np.geomspace(0.01, 2, 12)])
 
@@ -58,12 +58,6 @@ def test_values_that_are_not_finite_leave_the_others_as_they_are():
     values[0] = np.inf  # a corner
     others = np.isfinite(values)
     assert abs(grid(known(grid, values)) - values)[others].max() < 1e-12
-
-
-def test_the_share_beyond_the_largest_error_is_exceeded_as_seldom_as_it_says():
-    # (1 - p)^n = 0.05 / 2^k
-    assert (1 - share_beyond(64, 1)) ** 64 == pytest.approx(0.025)
-    assert share_beyond(64, 3) > share_beyond(64, 1) and share_beyond(0, 0) == 1.0
 
 
 @pytest.mark.parametrize(("draw", "least"), [("exponential", 0.97), ("uniform", 0.995)])

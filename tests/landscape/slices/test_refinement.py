@@ -150,7 +150,7 @@ def test_beyond_the_axes_no_more_evaluations_are_made_than_allowed(most):
 
 def test_of_noise_every_point_is_evaluated():
     found = sliced(noise, axes=(symmetric_axis(1.0, 21),) * 2)
-    assert found.evaluated.all() and found.reason == "exact" and found.interpolation_error == found.share_beyond == 0
+    assert found.evaluated.all() and found.reason == "exact" and found.interpolation_error == 0
     assert found.tolerance is None
 
 

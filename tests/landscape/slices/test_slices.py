@@ -27,7 +27,7 @@ def test_the_slice_of_a_quadratic_is_its_model():
     result = evaluate_slice(quadratic, CENTER, directions, AXES, gradient=G, operator=DenseOperator(A), settings=ALL)
     assert result.loss.shape == (5, 3) and result.center_loss == 7 and result.evaluations == 16
     assert result.evaluated.all()
-    assert result.reason == "exact" and result.interpolation_error == result.share_beyond == 0
+    assert result.reason == "exact" and result.interpolation_error == 0
     assert result.model is not None and (result.loss - result.model).abs().max() < 1e-13
     assert result.slope is not None and torch.allclose(result.slope, directions.T @ G, rtol=0, atol=1e-14)
     assert result.curvature is not None
