@@ -268,9 +268,10 @@ def test_an_interrupted_slice_leaves_the_old_record_says_how_it_is_continued_and
     said = " ".join(capsys.readouterr().err.split())
     assert f"what was rendered is kept; to continue: landscape {shlex.join(words)}" in said
     assert (out / "slice.json").read_bytes() == before
+    made = len(calls)  # other threads may have gone on until they were told
     record = sliced(out, run / "double.pt", *options)
     # of the 60 evaluations before it was stopped, a few were of the centre; the rest of the 121 are made now
-    assert len(calls) - 61 <= 121 - 60 + 2 * 5
+    assert len(calls) - made <= 121 - 60 + 2 * 5
     whole = sliced(tmp_path / "whole", run / "double.pt", *options)
     for group, arrays in whole.arrays.items():
         for name, array in arrays.items():
