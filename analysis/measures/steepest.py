@@ -2,15 +2,15 @@
 
 mass       of Gaussian i in a unit vector v: the sum of v^2 over its parameters
 carriers   the Gaussians with a share of LEAST of the mass or more, MOST at most; the heaviest in any case
-view       the one in which the first carrier has most weight
+view       the one in which the first carrier has most weight: the sum of alpha T over the pixels (`Sight.weight`, px)
 steps      sqrt(2 RISE L / |lambda|), at which curvature alone changes the loss L by RISE L, halved again and again
 factor     of a step s: the mean change of the rendered loss at +s and -s, over lambda s^2 / 2; the slope cancels, and the
            factor is 1 where the second-order model holds
 kinks      sum_p w j^2 [|r| < NEAR] / NEAR over the numbers p of the images (w: weight in the loss, r: residual, j: its change
            along v): the mean of w (|r + s j| + |r - s j| - 2 |r|) / s^2 where residuals are spread evenly near 0.  A curvature
            that L1 has in every direction, never below 0, and that the Hessian, at signs held still, leaves out
-renders    of the view around the first carrier, all Gaussians moved by -step, 0 and +step along v; the step is the longest
-           whose factor is within AGREES of 1, else the longest whose factor is above 0, else the longest of all
+renders    of the part of the view around the carriers, all Gaussians moved by -step, 0 and +step along v; the step is the
+           longest whose factor is within AGREES of 1, else the longest whose factor is above 0, else the longest of all
 
 Why renders can refute a small negative end.  On fern (2,000 steps) lambda_min is -0.074, but second differences of rendered
 losses over 1/4 to 4 steps of the optimiser are +0.20 to +0.22.  Kinks of L1 make 0.11 to 0.17 of the gap (0.15 by the formula),
@@ -72,9 +72,10 @@ class End:
 def steepest(
     objective: SceneObjective, end: End, values: Values, sights: Sequence[Sight], file: str
 ) -> tuple[Steepest, Pictures]:
-    """Carriers, steps and pictures of an eigenvector.  Pictures in bytes: view, photograph, minus, zero, plus, difference.
+    """Carriers, steps and pictures of an eigenvector.  Pictures in bytes: `view`, the whole photograph; and of the
+    crop `photograph`, `minus`, `zero`, `plus`, `difference`.
 
-    values, sights: from `scene_fields`.  file: name of the pictures' file, for the record.
+    values, sights: from `splat.curvature.fields.scene_fields`.  file: name of the pictures' file, for the record.
     """
     mass = masses(end.vector, objective.active)
     mass, spread = mass / mass.sum(), participation(mass)
@@ -111,7 +112,7 @@ def heaviest(
     random = masses(torch.empty_like(objective.active.flat).normal_(generator=generator), objective.active)
     on_cpu = objective.active.flat.device.type == "cpu"
     sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views] if on_cpu else []
-    values, found = sight_fields(sights) if on_cpu else {}, []
+    values, found = (sight_fields(sights) if on_cpu else {}), []
     for vector in vectors:
         mass = masses(vector, objective.active)
         mass, i = mass / mass.sum(), int(mass.argmax())
@@ -171,7 +172,7 @@ def _losses_at(
 def shown_step(factors: Sequence[float]) -> int:
     """Index of the longest step whose factor is within AGREES of 1, else of the longest with one above 0, else of the longest.
 
-    factors: of steps that descend.
+    factors: of the steps, the longest first.
 
     >>> shown_step([0.5, 1.1, 0.9]), shown_step([-0.2, 0.5]), shown_step([-0.2, -1.0])
     (1, 1, 0)
@@ -181,10 +182,10 @@ def shown_step(factors: Sequence[float]) -> int:
 
 
 def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Sequence[float]) -> str:
-    """Sentence that compares renders with the curvature, at the step shown and over all steps, which descend."""
+    """Sentence that compares renders with the curvature, at the step shown and over all steps, the longest first."""
     best = shown_step(factors)
     step, factor = steps[best], factors[best]
-    alone = 50 * end.curvature * step**2 / loss  # half of it, in percent of the loss
+    alone = 50 * end.curvature * step**2 / loss  # curvature step^2 / 2, in percent of the loss
     extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])} units of the parameters"
     ways = ("lower", "raise") if end.curvature < 0 else ("raise", "lower")
     if not factor > 0:
@@ -232,7 +233,7 @@ def _carrier(
 def outline_of(splat: Float64[Tensor, "9"]) -> list[float]:
     """Ellipse of a splat (place x, y; inverse covariance a, b, c; ...) at SIGMAS standard deviations.
 
-    Centre x, y and half axes in px, angle of the longer axis.
+    Centre x, y and half axes in px; angle of the longer axis from x towards y, in radians.
 
     >>> outline_of(torch.tensor([5.0, 6.0, 0.25, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
     [5.0, 6.0, 4.0, 2.0, 0.0]
@@ -259,7 +260,7 @@ def crop_around(outlines: Sequence[Sequence[float]], width: int, height: int) ->
     )
     size = np.array([width, height])[:, None, None, None]
     inside = points[:, ((points >= 0) & (points <= size)).all(axis=0)]
-    ends = inside if inside.size else np.array(outlines)[:1, :2].T
+    ends = inside if inside.size else np.array(outlines)[:1, :2].T  # none inside: the first centre
     (left, top), (right, bottom) = ends.min(axis=1), ends.max(axis=1)
     share = min(max(ROOM * max((right - left) / width, (bottom - top) / height), 1 / SMALLEST), 1.0)
     x, y = (left + right) / 2, (top + bottom) / 2
@@ -301,8 +302,9 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
     """
     first = carriers[0]
     name = max(first.attributes, key=first.attributes.__getitem__)
-    some = "both" if count == 2 else f"all {count}"
-    seen = "one view" if first.views == 1 else f"{some if first.views == count else f'{first.views} of {count}'} views"
+    every = "both" if count == 2 else f"all {count}"
+    some = every if first.views == count else f"{first.views} of {count}"
+    seen = "one view" if first.views == 1 else f"{some} views"
     if first.views > 1 and first.one_view >= 0.9:
         seen += f", with {first.one_view:.0%} of its weight in one"
     alone = "" if first.share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
@@ -315,7 +317,7 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
 def shape(first: Carrier, view: View) -> str:
     """Kind and place of a carrier's splat in a view, in words."""
     kind = f"a splat of {ratio(first.aspect)}"
-    if first.aspect**2 > NEEDLE:
+    if first.aspect**2 > NEEDLE:  # the condition number of its covariance in the picture
         large, middle, small = first.sigmas
         flat = large * small < middle**2  # nearer to a disc than to a rod
         kind = f"{'a plate seen edge-on' if flat else 'a needle'}, {ratio(first.aspect)} in the picture,"

@@ -1,9 +1,9 @@
 """Eigenpairs at the two ends of the spectrum.
 
-`extreme_eigenpairs` grows one subspace for both ends by a Lanczos recurrence (`krylov`).  A run ends when the measured
-residual of every wanted pair is under max(rtol |lambda|, atol) or at the noise of a matvec, when the basis spans the whole
-space, or when matvecs or seconds are spent.  Where the basis spans an invariant subspace, one more step must leave the wanted
-values unchanged.
+`extreme_eigenpairs` grows one subspace for both ends by a Lanczos recurrence (`krylov`).  A run ends when the
+reported residual of every wanted pair is at most max(rtol |lambda|, atol), or at the noise of a matvec, when the basis spans
+the whole space, or when matvecs or seconds are spent.  Where the basis spans an invariant subspace, one more step must leave
+the wanted values unchanged.
 
 Davidson's method, preconditioned by diagonal blocks, would take fewer products.  But it can miss an extreme eigenvalue that
 only the entries outside these blocks make, and converge to its neighbour; a Lanczos recurrence finds such ends, too.
@@ -32,7 +32,7 @@ def extreme_eigenpairs(
     start: Float[Tensor, "n *k"] | None = None,
     progress: Progress | None = None,
 ) -> EigenEnds:
-    """The largest and smallest eigenvalues with vectors and residuals; by default one of each, its residual 0.1% of it.
+    """The largest and smallest eigenvalues with vectors and residuals; by default one of each, to a residual of 0.1% of it.
 
     start: a warm start from one or more vectors, such as eigenvectors of an earlier checkpoint.  The first vector of the
     recurrence is then the sum of their directions, scaled to length 1, plus a random vector of length settings.noise; None: a
@@ -58,7 +58,7 @@ def extreme_eigenpairs(
         ritz = space.ritz()
         if progress:
             progress(space.matvecs, settings.max_matvecs, ritz.state())
-        # room is left for one more step with its noise, and for measuring every pair
+        # no room for a step (block), its noise (1), one product of all pairs together (1) and one of each (wanted)
         spent = space.matvecs + settings.block + settings.wanted + 2 > settings.max_matvecs
         late = monotonic() > deadline
         # below the noise of a product no residual is asked for
@@ -67,12 +67,14 @@ def extreme_eigenpairs(
         # with no more values than wanted pairs, the last one may belong to the other end; in an invariant subspace a copy of
         # a wanted value may be missing until the values stand still
         settled = space.size > settings.wanted and not (space.exhausted(ritz, goal) and ritz.moved(before, goal))
-        near = ritz.near(space.seen_noise, goal)  # its noise: the next step measures it
+        # an open residual may be the noise of a product: then the next step measures that
+        near = ritz.near(space.seen_noise, goal)
         converged = complete or (settled and not ritz.open(goal))
         before = ritz.values[ritz.wanted]
         if converged or spent or late:
             ends, more = space.measured(ritz, "time budget" if late else "matvec budget", converged)
             if not more or complete or spent or late:
                 return ends
-            strictness /= 2  # measured residuals miss what those of the recurrence meet: ask for half of these
+            # the reported residuals miss the goal that those of the recurrence meet: halve the recurrence's goal
+            strictness /= 2
         space.make_room(ritz)

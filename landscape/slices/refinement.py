@@ -6,10 +6,13 @@
                 they are, the closer the bound is to the largest error.  If the bound is within tolerance * range, the slice is
                 done, with these predictions; else fill again, and the interpolant has the points held out, too
 
+bound: `interpolation.error_bound`, of the error at every point not known, from the errors at the points held out; the k-th
+hold-out may err with a chance of 5% / 2^k.  range: largest less smallest of the values evaluated.
+
 A slice keeps the interpolant that was judged.  Fitting it again with the points held out made it worse in 95% of the draws on
 a fern's planes: some lie next to an axis, where the spline of (f - axes) / (x y) magnifies jumps.  A plane whose bound is not
-within the tolerance at max_evaluations is not resolved: its points are those that were evaluated.  Decisions are made once a
-hold-out, so that the result does not depend on the number of workers.
+within the tolerance at max_evaluations is not resolved: its points are those that were evaluated.  Decisions are made when
+a whole hold-out is evaluated, so that the result does not depend on the number of workers.
 """
 
 from dataclasses import dataclass
@@ -31,8 +34,9 @@ class SliceSettings:
     """Rules for the points of a plane to evaluate; the others are interpolated.
 
     tolerance: of the interpolation, as a share of the range of the values; None: every point is evaluated.
-    holdout: fewest random points of a hold-out.  Where the largest error at 64 of them is within the tolerance, at most 5.6% of
-        the other points are not, with 97.5% confidence (the first look has half of 5%); `error_bound` extrapolates to all.
+    holdout: fewest random points of a hold-out, or all that are left.  Where the largest error at 64 of them is within the
+        tolerance, at most 5.6% of the other points are not, with 97.5% confidence at the first hold-out; `error_bound`
+        extrapolates to all.
     workers: threads that evaluate.
     max_evaluations: budget, which counts the axes and the centre, always evaluated, and points kept from an earlier run.
         Allowed only with a tolerance.
@@ -81,7 +85,7 @@ def evaluate_adaptively(
     while not (known := evaluations.known).all():  # `require` sets entries of this array
         filling = grid.farthest(known, fill)
         drawn = _draw(known, filling, max(settings.holdout, fill), generator)
-        # 1: the centre
+        # 1: the loss at the centre, which is evaluated apart from the grid's points
         if 1 + int(known.sum()) + len(filling) + len(drawn) > settings.max_evaluations:
             return Refined(evaluations.value, errors, looks, "evaluation budget")
         evaluations.require(filling)

@@ -10,8 +10,8 @@ intervals (each at 97.5%, so that two hold together with at least 95%).  The eig
 operator; where lambda_min may be zero its bracket is for the modulus, without an upper bound.
 
 The bracket of an end is sure to contain a true eigenvalue, but not sure to contain the end.  A search that stops at its
-tolerance may have found the end's neighbour, if the two are about rtol apart.  Then the end lies outside its bracket, and every
-index made of it: on a Cauchy spectrum (n = 100, rtol = 1%) in 27 of 250 seeds, on spectra with a gap at the ends in none.
+tolerance may have found the end's neighbour, if the two are about rtol apart.  Then the end lies outside its bracket, and an
+index made of it may: on a Cauchy spectrum (n = 100, rtol = 1%) in 27 of 250 seeds, on spectra with a gap at the ends in none.
 `EigenEnds.beyond` bounds how far out it may lie; brackets include it only for ends that stopped early.
 """
 
@@ -66,8 +66,9 @@ def anisotropy(ends: EigenEnds, density: SpectralDensity | None = None) -> Aniso
 def eigenvalue_ratio(ends: EigenEnds) -> Bracket:
     """lambda_max / lambda_min, signed: StableGS's Eq. (3).
 
-    The value is always the quotient of the two ends found.  Where lambda_min may be 0, the bracket is for its modulus, and has
-    no upper bound.  The note says so, or else whether the operator is definite, as far as lambda_max tells.
+    The value is the quotient of the two ends found, None where the smallest found is 0.  Where lambda_min may be 0, the
+    bracket is for its modulus, and has no upper bound.  The note says so, or else whether the operator is definite, as far as
+    lambda_max tells.
     """
     top, bottom = _intervals(ends)
     smallest = float(ends.smallest.values[0])
@@ -76,7 +77,7 @@ def eigenvalue_ratio(ends: EigenEnds) -> Bracket:
         return Bracket(
             value, _at_least(top, bottom), inf, "lambda_min is not resolved from zero: the bracket is for its modulus"
         )
-    quotients = [a / b for a in top for b in bottom if isfinite(a) or isfinite(b)]
+    quotients = [a / b for a in top for b in bottom if isfinite(a) or isfinite(b)]  # infinity / infinity is left out
     note = "lambda_max is not resolved from zero: definite or indefinite"
     if top[0] > 0 or top[1] < 0:
         note = "definite" if bottom[0] > 0 or top[1] < 0 else "indefinite"
@@ -84,7 +85,7 @@ def eigenvalue_ratio(ends: EigenEnds) -> Bracket:
 
 
 def negative_ratio(ends: EigenEnds) -> Bracket:
-    """|min(lambda_min, 0)| / lambda_max of an operator with a positive curvature; undefined (None) for any other."""
+    """|min(lambda_min, 0)| / lambda_max; None without a positive curvature, and where lambda_max is not resolved from 0."""
     top, bottom = _intervals(ends)
     if top[1] <= 0:
         return Bracket(None, inf, inf, "no positive curvature: the operator is negative semi-definite")
@@ -114,11 +115,11 @@ def participation_ratio(ends: EigenEnds, density: SpectralDensity) -> Bracket:
     unit = total.value  # so that no square leaves the range of floats
     squares = density.integral(lambda x: (x / unit).square(), JOINT)
     least, middle, most = (max(value, least_magnitude) / unit for value in (total.low, unit, total.high))
-    floor = (least_magnitude / unit) ** 2
-    low = least**2 / max(squares.high, floor)
-    square = max(squares.low, floor)
-    high = most**2 / square if square else inf
-    value = min(max(middle**2 / max(squares.value or 0.0, floor), 1.0), float(density.dim))
+    least_square = (least_magnitude / unit) ** 2
+    low = least**2 / max(squares.high, least_square)
+    least_sum = max(squares.low, least_square)
+    high = most**2 / least_sum if least_sum else inf
+    value = min(max(middle**2 / max(squares.value or 0.0, least_square), 1.0), float(density.dim))
     return Bracket(value, max(low, 1.0), min(high, float(density.dim)), total.note)
 
 
@@ -126,7 +127,8 @@ def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float
     """Intervals of lambda_max and lambda_min: their residuals, plus one unit of round-off of the larger magnitude.
 
     A residual says that an eigenvalue is near, not that none is farther out: an end that ran out of its budget reaches
-    out by `ends.beyond`.  Neither end lies beyond what the other one may be.
+    out by `ends.beyond`.  lambda_max is no lower than the least that lambda_min may be, lambda_min no higher than the most that
+    lambda_max may be.
     """
     if not (len(ends.largest) and len(ends.smallest)):
         raise InputError(
@@ -147,7 +149,7 @@ def _least_magnitude(ends: EigenEnds) -> float:
 
 def _quotients(top: tuple[float, float], sizes: tuple[float, float]) -> tuple[float, float]:
     """The least and the largest quotient of a number in `top` and one above 0 in `sizes`."""
-    # a positive end is least over the largest size and most over the smallest; a negative one the other way round
+    # a bound of 0 or more is least over the larger size and most over the smaller; a negative one the other way round
     over = sizes[1 if top[0] >= 0 else 0], sizes[1 if top[1] < 0 else 0]
     least, most = (
         end / size if size else copysign(inf, end) if end else 0.0 for end, size in zip(top, over, strict=True)

@@ -5,7 +5,8 @@ find it too short by chance.  So a run that misses its tolerance looks again onl
 meets it looks again CONFIRMATION probes later and stops if it still does (Simons 1968).  For the chance that is left its
 interval is wider by WIDENING.
 
-A block is some of the rows; a group is GROUP probes, whose pairs are summed together.
+A block is some of the rows; a group is GROUP probes whose vectors are kept together, for the z_i^T H z_j of every two of them,
+which tell the variance (`quadratic`).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +29,7 @@ from landscape.traces.quadratic import FEWEST, PowerSums, mean_interval, power_s
 
 Reading = Literal["block", "full"]
 Method = Literal["auto", "hutchinson", "hutch++", "xtrace"]
-LEAST = 8  # probes, for an interval: see the degrees of freedom in `quadratic`
+LEAST = 8  # probes, for an interval by `quadratic`
 GROWTH = 1.5  # ratio of the numbers of probes at two looks
 CONFIRMATION = 4  # probes between reaching the tolerance and stopping
 WIDENING = 1.05  # factor of the interval of an adaptive run
@@ -108,7 +109,11 @@ class TraceSettings:
 
 
 class StoppingRule:
-    """When an adaptive run looks at its interval, and when it ends.  next: number of probes at the next look."""
+    """When an adaptive run looks at its interval, and when it ends.
+
+    first: probes at the first look; most: probes at which the run ends in any case; confirmation: probes between the look that
+    reaches the tolerance and the one that confirms it.  next: number of probes at the next look.
+    """
 
     def __init__(self, first: int, most: int, confirmation: int = CONFIRMATION) -> None:
         self.next, self._most, self._confirmation, self._confirming = first, most, confirmation, False
@@ -125,9 +130,9 @@ class StoppingRule:
 class Hutchinson:
     """Hutchinson's estimator on one operator, for several blocks at once.
 
-    rows: of the blocks, by name.  samples: z^T H z, a row for each block.  known: part of the trace that the operator lacks,
-    added to every block, so that there may be one alone; spent: matvecs of this part.  keep: most probes that stay, with their
-    products, in `kept`, which is emptied when there are more.
+    rows: of the blocks, by name.  samples: (blocks, probes), the sum of z_r (H z)_r over a block's rows r.  known: part of the
+    trace that the operator lacks, of a single block; else 0.  spent: matvecs of this part.  keep: most probes that stay, with
+    their products, in `kept`, which is emptied when there are more.
     """
 
     def __init__(
@@ -151,7 +156,7 @@ class Hutchinson:
 
     def estimate(self, progress: Progress | None = None) -> dict[str, TraceEstimate]:
         """The trace of every block.  Progress counts matvecs."""
-        *_, (estimates, _) = self.looks(self.settings.min_probes, progress)
+        *_, (estimates, _) = self.looks(self.settings.min_probes, progress)  # of the last look
         return estimates
 
     def looks(self, first: int, progress: Progress | None = None) -> Iterator[tuple[dict[str, TraceEstimate], bool]]:
@@ -161,8 +166,8 @@ class Hutchinson:
         """
         settings, probes, rule, ended = self.settings, 0, StoppingRule(first, self.settings.max_probes), False
         if self.operator.dim == 0:
-            exact = (self.known, settings.confidence, self.spent)
-            yield {name: TraceEstimate.exact(name, 0, *exact) for name in self.rows}, True
+            known = (self.known, settings.confidence, self.spent)  # value, confidence, matvecs
+            yield {name: TraceEstimate.exact(name, 0, *known) for name in self.rows}, True
             return
         while not ended:
             # no further than the next look or the end of a group

@@ -10,12 +10,13 @@ A prime is a derivative.  With g = l' (the gradient in I) and a = C'^T g,
 
 Regularisers are added to value, gradient and H u; they have no part in G u.
 
-P' and P'' of every Gaussian, tile lists, final transmittances, g and a are computed once.  H U is then two passes over the
-pixels for K vectors together, the columns of U (p, K), laid out like `Gaussians.flat`; G U is one, and another for each vector.
+P' and a . P'' of the Gaussians that reach a tile before its pixels stop, tile lists, final transmittances, g and a are
+computed once.  H U is then two passes over the pixels for K vectors together, the columns of U (p, K), laid out like
+`Gaussians.flat`; G U takes one for all vectors, and one more for each.
 What is piecewise constant counts as constant: the order of the splats, the alpha_min cut, where a pixel stops, and the clamps.
 
-Shapes: p parameters, n splats, 9 numbers of a splat (place, inverse covariance, opacity, colour), h x w pixels of the image,
-H x W of whole tiles.
+Shapes: p parameters, n splats, k vectors (K above), 9 numbers of a splat (place, inverse covariance, opacity, colour), h x w
+pixels of the image, H x W of whole tiles, 4 planes: red, green, blue, accumulated alpha.
 
 Tangents and adjoints of splats are in the coordinates of `projection/whitening.py`.  On a GPU, products do not synchronise with
 the device.
@@ -41,7 +42,8 @@ from splat.render.backend import Adjoint, Raster, Tangent, backend_of
 from splat.render.formulas import BLOCK_SUMS
 from splat.render.forward import rasterize_view, touches
 
-LOSS_PLANES = 34  # a linearized loss keeps: target, its moments, gradient, blur(S_p), second derivatives, a product
+# a linearized loss keeps: target, its moments, gradient, SSIM's blur(S_p) (`losses/formulas.py`), second derivatives, a product
+LOSS_PLANES = 34
 DOUBLE_BLOCK = 8 * 9 * 9  # bytes of a 9 x 9 block in double precision
 VECTORS = 8  # most vectors in a product at a time: more would not fit into the second-level cache
 
@@ -143,7 +145,7 @@ class LinearizedView:
         return self._raster.crop(self._tangent(U).planes).contiguous()
 
     def vjp(self, G: Float[Tensor, "k 4 h w"]) -> Float[Tensor, "p k"]:
-        """J^T G for cotangents of colour and accumulated alpha."""
+        """J^T times cotangents (here G, not Gauss-Newton's) of colour and accumulated alpha."""
         if G.dtype != self.gaussians.flat.dtype:
             raise ValueError(f"expected cotangents of {self.gaussians.flat.dtype}, got {G.dtype}; use G.to(...)")
         return self._pullback([self._raster.backward(self._raster.pad(g)) for g in G])
@@ -152,7 +154,8 @@ class LinearizedView:
         self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, ssim_window: bool = True
     ) -> Float[Tensor, "p k"]:
         """H U; added to total in place, where that is given.  ssim_window: False for the pixel-diagonal of l'' alone."""
-        return self._regularizers.add_product(self._projection.vjp(self._adjoint_tangent(U, ssim_window), U, total), U)
+        product = self._projection.vjp(self._adjoint_tangent(U, ssim_window), U, total)  # with U it adds (a . P'') U
+        return self._regularizers.add_product(product, U)
 
     def ggn(
         self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, ssim_window: bool = True

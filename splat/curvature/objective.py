@@ -2,8 +2,9 @@
 
     L(theta) = 1/M sum_m l(I_m(theta)) + R(theta)
 
-theta: the parameters of the active Gaussians, laid out like `Gaussians.flat`; I_m: the render of view m; l: the loss against
-its picture; R: regularisers of opacities and scales, where there are any (`losses/regularizers.py`).  Parameters that no l can
+theta: the parameters of the active Gaussians, laid out like `Gaussians.flat`; I_m: the render of view m, of M; l: the loss
+against its picture; R: regularisers of opacities and scales, where there are any (`losses/regularizers.py`).  Parameters that
+no l can
 depend on are removed and counted: Gaussians that touch no pixel of any view, and SH bands not in use; their share of R is a
 constant.  Quaternions are normalised: this changes no image, and makes the trace of their block of the Hessian, which scales
 with 1/|q|^2, well defined.
@@ -62,8 +63,8 @@ class SceneObjective:
     keep_unseen: all Gaussians are active, for steps so long that Gaussians out of sight may come into sight.
 
     active: the Gaussians that touch a pixel of some view (with keep_unseen all), with unit quaternions; L is studied at
-    `active.flat` (p,), the lengths of the quaternions included.  mask: which of the given Gaussians are active.  counts: how
-    many Gaussians and parameters are.
+    `active.flat` (p,), the lengths of the quaternions included.  mask: which of the given Gaussians are active.  counts:
+    numbers of Gaussians and parameters, given and active.
 
     Raises NothingInSight where no Gaussian is seen, InputError where there is no view or no Gaussian, or a parameter or the
     background is not finite.
@@ -222,9 +223,11 @@ class SceneObjective:
         for done, view in enumerate(self.linearized, start=1):
             found = view.block_diagonals(approximate=approximate, parts=parts)
             traces.append([each.traces(self.active.quats) if traced else {} for each in found])
-            for total, each in zip(totals, found, strict=False):  # none before the first view
-                total.add(each)
-            totals = totals or found
+            if done == 1:
+                totals = found
+            else:
+                for total, each in zip(totals, found, strict=True):
+                    total.add(each)
             if progress:
                 progress(done, len(self.views), "blocks of every Gaussian")
         count = len(self.views)

@@ -43,17 +43,17 @@ TRIALS = 2  # renders that find a step
 FACTOR = 1e4  # the largest by which a trial changes h
 ROUNDING = 1 / 4  # mean error of a rounded number, in units of eps
 KEPT = 1 << 30  # bytes for J^T g of the first views; each other view costs one backward pass more in a product
-SEEN = 3  # a smaller change of an image is noise, of which that of two renders is sqrt(2)
+SEEN = 3  # times the noise: a smaller change of an image may be noise alone, by which two renders differ by sqrt(2)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ProductErrors(ShortRepr):
-    """Errors of the products with k vectors, as lengths.
+    """Errors of the products with k vectors.
 
-    step: of the difference to the product at twice the step.  An error in proportion to h or a higher power changes by at
-    least its own size when h doubles; those of rounding and jumps differ at random.
-    noise: of the difference of two equal products, over sqrt(2); 0 for a renderer that repeats itself.
-    kinks: share of |J v|^2 in pixels whose one-sided differences disagree.
+    step: length of the difference to the product at twice the step.  An error in proportion to h or a higher power changes by
+    at least its own size when h doubles; those of rounding and jumps differ at random.
+    noise: length of the difference of two equal products, over sqrt(2); 0 for a renderer that repeats itself.
+    kinks: no length, but the share of |J v|^2 in pixels whose one-sided differences disagree.
 
     J^T, from the renderer's own backward pass, is taken as exact: `check_renderer` compares it with J.
     """
@@ -112,10 +112,11 @@ class RendererHessian:
         agree before a slash, as sh/dc and sh/rest, are one.
     loss: from (image, view) to a tensor of one number, by torch operations that are differentiable twice in the image.
     views: one graph at a time is kept, whatever their number.
-    noise: standard deviation of the renderer's noise, relative to the size of the image; raised to what two renders of the
-        first view show.
+    noise: standard deviation of the renderer's noise, relative to the image's root mean square; raised to what two renders of
+        the first view show.
 
     value, gradient: of the mean loss.  gauss_newton: the operator J^T l'' J.  deterministic: whether the two renders are equal.
+    curved: whether products have the second term; point: the parameters at hand then; kept: J^T g of the first views.
     Products move the parameters in place, and bring them back to the bit, after an exception too.  Approximations: see `error`.
 
     >>> x = torch.tensor([0.5, 2.0], dtype=torch.float64, requires_grad=True)
@@ -230,7 +231,7 @@ class RendererHessian:
     def products(
         self, V: Float[Tensor, "n k"], factor: float = 1.0
     ) -> tuple[Float[Tensor, "n k"], Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-        """H V, the share of |J v|^2 in kinked pixels, and the steps h, which are `factor` times as long as they should be."""
+        """H V, the share of |J v|^2 in kinked pixels, and the steps h: `factor` times those of `step`, 0 where none sees v."""
         total, kinks = torch.zeros_like(V), torch.zeros(2, V.shape[1], dtype=torch.float64)
         steps = [0.0] * V.shape[1]
         with self.at_point():
@@ -263,21 +264,23 @@ class RendererHessian:
         """The step h along v; 0 where it does not change the image, or by its noise alone."""
         largest, size, seen = float(v.abs().max()), rms(view.image) or 1.0, False
         noise = SEEN * self.noise * size
-        # at first the largest parameter moves by `change` of its size
+        # at first the largest entry of h v is `change` times the largest parameter
         h = self.change * (float(self.point.abs().max()) or 1.0) / largest if largest else 0.0
         for _ in range(TRIALS if largest else 0):
             self.parameters.write(self.point.double() + h * v.double())
-            change = rms(self.image(index, view.image) - view.image)
-            seen, change = change > noise, max(change, noise)
-            # the change grows like h
-            h *= min(max(self.change * size / change, 1 / FACTOR), FACTOR) if change else 0.0
+            moved = rms(self.image(index, view.image) - view.image)
+            seen, moved = moved > noise, max(moved, noise)
+            # the image's change grows like h
+            h *= min(max(self.change * size / moved, 1 / FACTOR), FACTOR) if moved else 0.0
         self.parameters.write(self.point)
         return h if seen else 0.0
 
     def change_of_image(
         self, index: int, view: LinearView, v: Tensor, h: float, cotangent: Tensor | None = None
     ) -> tuple[Tensor, Bool[Tensor, "..."], list[Tensor]]:
-        """J v of one view, where its one-sided differences disagree, and J+^T and J-^T of a cotangent; two renders."""
+        """Three results, from two renders: J v of one view; a mask of where its one-sided differences disagree; and J+^T c and
+        J-^T c of a cotangent c, or nothing without one.
+        """
         images, pulled = [], []
         for step in (h, -h):
             self.parameters.write(self.point.double() + step * v.double())
@@ -293,7 +296,7 @@ class RendererHessian:
     def _product(
         self, index: int, view: LinearView, Jg: Tensor | None, v: Tensor, h: float
     ) -> tuple[Tensor, Tensor, Bool[Tensor, "..."]]:
-        """H_m v of one view, J v, and where its one-sided differences disagree.  Jg: J^T g."""
+        """H_m v of one view; J v; a mask of where its one-sided differences disagree.  Jg: J^T g."""
         Jv, apart, pulled = self.change_of_image(index, view, v, h, view.gradient.detach() if self.curved else None)
         product = self.parameters.vjp(view.image, view.curvature(Jv), keep=True)
         if self.curved and Jg is not None:

@@ -10,7 +10,9 @@ u, v     whitened offset of a pixel from the splat's mean: u is the same in all 
 terms    what gives v and log2 alpha of any row of the tile (`tile.alpha_terms`)
 top, bottom   the first row that the splat touches, and one past the last
 b, p     where a row begins: in `state`, and in a plane of the picture
-T        transmittance, of each pixel; from the splat on that stops a pixel, -T is kept: its sign says "stopped"
+T, STOP, IMAGE, REST, GRAD   in code, the vectors of a row in `state`, by number (a colour takes three): T lies at b + T * L;
+         a row has FORWARD or BACKWARD of them
+T        in formulas, transmittance; `forward` keeps -T in front of the splat that stopped a pixel: its sign says "stopped"
 v_...    cotangent: the loss's derivative in what follows
 """
 
@@ -66,7 +68,7 @@ def forward(counter, params, lists, frame, pixels):
         first = np.int64(lists.start[tile])
         count = lists.start[tile + 1] - first
         some_stopped = False
-        # front to back; every 16 splats: have all pixels stopped?
+        # front to back; every 16 splats, if one has stopped since the last look: have all pixels?
         for k in range(count):
             prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
             some_stopped |= composite(params, lists, first + k, k, x0, y0, frame, state)
@@ -91,14 +93,14 @@ def composite(params, lists, e, k, x0, y0, frame, state):
         # alpha of the row, 0 where the pixel has stopped
         alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, before > 0.0, frame.cap)
         w = alpha * before
-        after = fma(-alpha, before, before)  # T - w, to the last bit even where alpha is near 1
+        after = fma(-alpha, before, before)  # T - alpha T, rounded once
         ends = (after < frame.floor) & (before > 0.0)
         if any_lane(ends):  # these pixels stop in front of the splat
             w = select(ends, 0.0, w)
             after = select(ends, -before, after)
             store(state, b + STOP * L, select(ends, k, load(state, b + STOP * L)))
             stopped = True
-        # C += w c, T -= w
+        # image += w c, T -= w, with the splat's colour c
         store(state, b + T * L, after)
         store3(state, b + IMAGE * L, L, plus(load3(state, b + IMAGE * L, L), w, colour))
     return stopped
@@ -130,7 +132,7 @@ def all_stopped(state, L):
 
 @kernel
 def backward(counter, params, lists, frame, pixels, v_planes, sums):
-    """The loss's derivative in every splat, tile by tile: from that in the planes, the nine sums of every intersection.
+    """The nine sums of every intersection, from the loss's derivative in the planes; those of a splat make its adjoint.
 
     v_planes: derivatives in red, green, blue and alpha of each pixel.  sums: six moments of s, then three sums of w v_image.
     """
@@ -178,7 +180,7 @@ def differentiate(params, lists, e, k, x0, y0, frame, state, sums):
         # alpha as in `forward`
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
         R, v_image = load(state, b + REST * L), load3(state, b + GRAD * L, L)
-        # T and R in front of the splat; s, the derivative in ln alpha, is 0 where the cap holds (alpha at least `free`)
+        # T and R in front of the splat; s, the derivative in ln alpha, is 0 where alpha before the cap is above `free`
         before, rest, w, beta, _r, we = step_back(alpha, load(state, b + T * L), R, v_image, colour)
         s = select(uncapped <= frame.free, we - beta * R, 0.0)  # we: w (v_image . c)
         store(state, b + T * L, before)

@@ -3,14 +3,15 @@
     L = L_recon(Theta) + asp_weight L_recon(Theta') + vsp_weight mean_k l(I_k(Theta), I_k(Theta'))      Eqs. (15), (21), (22)
 
 Theta' is a probed copy of all Gaussians in all attributes (`attribute_probe.py`), new at every step.  Its steps count as
-constant: Eq. (14), Theta' = Theta + steps, gives gradients in Theta' to Theta as they are, those of quaternions turned back.  k
-are probed viewpoints (`viewpoint_probe.py`); l is the loss of training, between two renders.  There is no released code.
+constant: Eq. (14), Theta' = Theta + steps, gives gradients in Theta' to Theta as they are, those of quaternions turned back.
+L_recon compares renders with photographs: of one view, for Theta' with asp_views = "all" of all M training views.  k is one
+of K probed viewpoints (`viewpoint_probe.py`); l is the loss of training, between two renders.  There is no released code.
 
-Probing starts after `warm_up` steps.  A diagnosis every `every` steps computes the magnitudes rho, c / sqrt of the mean
-curvature of an attribute (Eq. (5)), from the traces of the Hessian's blocks over all training views, and the dominant occlusion
-edge of each view; both change slowly.  Density control is that of 3DGS, by the gradient of the sampled view only.  Where no
-training view sees a Gaussian, training continues with the last magnitudes and edges, or none.  The history notes this, and
-counts the probed viewpoints that see no Gaussian.
+Probing starts after `warm_up` steps.  A diagnosis every `every` steps computes the magnitudes rho = c / (tau + eps), tau =
+sqrt(max(tr H_b, 0) / dim) (Eq. (5); dim: `ProbeSettings.dimension`), from the traces of the Hessian's blocks H_b over all
+training views, and the dominant occlusion edge of each view; both change slowly.  Density control is that of 3DGS, by the
+gradient of the sampled view only.  Where no training view sees a Gaussian, training continues with the last magnitudes and
+edges, or none.  The history notes this, and counts the probed viewpoints that see no Gaussian.
 
 What the paper leaves open (more in `attribute_probe.py` and `viewpoint_probe.py`):
 
@@ -24,7 +25,7 @@ What the paper leaves open (more in `attribute_probe.py` and `viewpoint_probe.py
     probe.dose             constants  one c = 0.01 for all (Sec. 4)             "equal": one rise of the loss for all
     densify_after_warm_up  false      "we build on 3DGS", from step 500 on      true: Algorithm 1, line 18
 
-The same expectation for less:
+The same expectation for less; with sampled_every about the same, as a ratio is kept while the scene changes:
 
     viewpoints = "one"     drawn independently of the sampled view: the probe depends on that view, and always to pair the two
                            would change the mean of Eq. (21)
@@ -40,8 +41,8 @@ Accuracy.  tr H_b has an exact part and a sampled one (`splat/curvature/traces.p
 MOST_SAMPLES (four where `accuracy` is inf), is such that the 95% interval of rho is within `accuracy`; rho goes like the
 inverse root of the trace.  A trace that almost cancels can miss the accuracy: its standard error is in the history.
 
-Left out because it has no effect: the traces of attributes that are not probed; the probed copy where every rho is 0; each loss
-of weight 0; viewpoints that see nothing; the edges without edge rotation.
+Left out because it has no effect: the traces of attributes that are not probed; the probed copy where there are no magnitudes;
+each loss of weight 0; viewpoints that see nothing; the edges without edge rotation.
 """
 
 from collections.abc import Collection, Sequence
@@ -135,7 +136,7 @@ class StableGS(MethodSettings):
         if not self.densify_after_warm_up:
             return config.densify
         start = max(config.densify.begins(config.iterations), self.warm_up)
-        return replace(config.densify, start=start, start_share=1.0)
+        return replace(config.densify, start=start, start_share=1.0)  # it begins after min(start, start_share T)
 
     def scaled(self, config: TrainConfig, keep: Collection[str] = ()) -> TrainConfig:
         warm_up = round(self.warm_up * config.iterations / PAPERS_STEPS)
@@ -152,9 +153,9 @@ class RhoAccuracy(TraceSettings):
 class StableGSMethod(Method[StableGS]):
     """Training with StableGS.
 
-    magnitudes: of the probed attributes, by name.  normals: (x, y) in pixels of each training view's edge, 0 where it has none.
-    coupling: of the sampled parts of traces, `coupling_ratios`.  pair: seeds of the last probe and its number of parameters,
-    where the next step takes the opposite probe.
+    magnitudes: of the probed attributes, by name.  normals: unit normal (x, y) of each view's dominant edge, 0 where it
+    has none.  coupling: by attribute, the sampled part of its trace over an exact part, and its standard error.  pair: seeds of
+    the last probe and its number of parameters, where the next step takes the opposite probe.
     """
 
     def __init__(self, settings: StableGS, seed: int):
@@ -184,7 +185,7 @@ class StableGSMethod(Method[StableGS]):
         if since < 0 or (settings.asp_weight == settings.vsp_weight == 0):
             return base
         if since % settings.every == 0:
-            self._diagnose(step, sampled=since // settings.every % settings.sampled_every == 0)
+            self._diagnose(step, sampled=(since // settings.every) % settings.sampled_every == 0)
         # without magnitudes the probed copy equals the original, and agrees with it from everywhere; the gradient at hand
         # stands for that of its render, also with asp_views = "all" and where Gaussians are dropped
         if not self.magnitudes:
@@ -206,7 +207,7 @@ class StableGSMethod(Method[StableGS]):
                 self._count_unseen(step)
                 continue
             weight = settings.vsp_weight / (settings.vsp_share * len(poses))
-            in_probed = _plus(in_probed, compared.gradient(1), weight)
+            in_probed = _plus(in_probed, compared.gradient(1), weight)  # 1: in Theta', 0: in Theta
             if settings.vsp_gradient == "both":
                 in_base = _plus(in_base, compared.gradient(0), weight)
         total = base.gradient if in_probed is None else base.gradient + probed.pull(in_probed)
@@ -217,7 +218,7 @@ class StableGSMethod(Method[StableGS]):
         pair, drawn = self.pair, self._drawn
         self.pair = self._drawn = None
         if pair and pair[1] == gaussians.flat.numel():
-            return drawn or draw_steps(gaussians, self.magnitudes, pair[0]), -1.0
+            return (drawn or draw_steps(gaussians, self.magnitudes, pair[0])), -1.0
         seeds = draw_seeds(self.generator)
         drawn = draw_steps(gaussians, self.magnitudes, seeds)
         if self.settings.antithetic:
