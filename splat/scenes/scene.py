@@ -137,7 +137,8 @@ def load_scene(
     root = Path(path)
     if not root.is_dir():
         raise FileNotFoundError(
-            f"expected a scene folder, {root} {'is not a folder' if root.exists() else 'does not exist'}; see landscape sfm"
+            f"expected a scene folder, {root} {'is not a folder' if root.exists() else 'does not exist'}; "
+            "name the one that holds the cameras; landscape sfm makes it of photographs"
         )
     if not 1 <= downscale < float("inf"):
         raise InputError(f"expected downscale of at least 1, got {downscale}")

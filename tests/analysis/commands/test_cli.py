@@ -178,7 +178,10 @@ def test_a_scene_that_cannot_be_is_refused(scene, tmp_path, capsys):
     def told(folder: Path, *words: str, options: tuple[str, ...] = ()) -> None:
         refuse(capsys, arguments(folder, tmp_path / "run", *options), *words)
 
-    told(tmp_path / "nothing", "nothing does not exist; see landscape sfm")
+    told(
+        tmp_path / "nothing",
+        "nothing does not exist; name the one that holds the cameras; landscape sfm makes it of photographs",
+    )
     (tmp_path / "empty").mkdir()
     told(tmp_path / "empty", "camera poses", "empty folder")
     path = sorted((scene / "images").iterdir())[1]
