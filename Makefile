@@ -19,7 +19,7 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "expected Python 3.11 or newer, got " + sys.version.split()[0] + "; name one with: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
-	@echo "installing into $(VENV), which takes minutes and 1.8 GB"
+	@echo "installing into $(VENV), which takes minutes and 1.5 GB"
 	$(PIP) torch
 	$(PIP) --editable .
 	@touch $(STAMP)
