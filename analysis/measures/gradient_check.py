@@ -76,8 +76,7 @@ def check_against_gradient(
 ) -> ProductCheck:
     """The relative error of H_m v for one random v.  views: how many to take, spread evenly over all."""
     objective, found = hessian.objective, []
-    turns = objective.active.quats, objective.blocks["quats"]
-    direction = without_lengths(_direction(objective, generator)[:, None], *turns)[:, 0]
+    direction = _projected(objective.active, _direction(objective, generator))
     count = len(objective.views)
     for index in sorted({round(i) for i in np.linspace(0, count - 1, min(views, count))}):
         found.append(_of_view(objective, index, direction))
@@ -117,8 +116,7 @@ def _in_double(objective: SceneObjective, view: View) -> SceneObjective:
 
 def _product(view: LinearizedView, direction: Float[Tensor, " p"]) -> Float64[Tensor, " p"]:
     """P H_m v."""
-    turns = view.gaussians.quats, view.gaussians.blocks["quats"]
-    return without_lengths(view.hvp(direction[:, None]), *turns)[:, 0].double()
+    return _projected(view.gaussians, view.hvp(direction[:, None])[:, 0]).double()
 
 
 def _differences(
@@ -169,9 +167,7 @@ class _Gradient:
         loss = view_loss(image, self.loss) + self.weight * (turned * image).sum()
         _pull(torch.autograd.grad(loss, moving), at, total, self.camera, self.settings)
         self.regularizers(at).add_gradient(total.flat)
-        return without_lengths(total.flat[:, None], self.active.quats, self.active.blocks["quats"])[
-            :, 0
-        ], image.detach()
+        return _projected(self.active, total.flat), image.detach()
 
 
 def _chunks(gaussians: Gaussians) -> Iterator[tuple[slice, Gaussians]]:
@@ -191,6 +187,11 @@ def _pull(
         (gradient,) = torch.autograd.grad(found, some.flat, [adjoint[rows] for adjoint in adjoints])
         for sum_of, part in zip(total.attributes.values(), some.with_flat(gradient).attributes.values(), strict=True):
             sum_of[rows] += part
+
+
+def _projected(gaussians: Gaussians, v: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
+    """P v: the lengths of the quaternions are the only null directions in which a gradient may have a component."""
+    return without_lengths(v[:, None], gaussians.quats, gaussians.blocks["quats"])[:, 0]
 
 
 def _direction(objective: SceneObjective, generator: torch.Generator) -> Float[Tensor, " p"]:

@@ -145,7 +145,6 @@ def _linearised(objective: SceneObjective, settings: ProbeSettings, ranks: Ranks
     gradient = objective.gradient
     report(1, 1, views)
     value = objective.loss(objective.active.flat)
-    objective.approximate_blocks  # noqa: B018 (cached, for the stages)
     return _Point(objective, hessian, CountingOperator(operator), settings, gradient, value, ranks)
 
 

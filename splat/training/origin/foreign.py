@@ -89,8 +89,8 @@ def _require_said(found: SplatFile, ask: Foreign, path: Path, train: Sequence[st
     asked = (ask.train_list, ask.guess_views, train is not None, ask.views is not None)
     views = any((*asked, found.train, "eval" in found.settings))
     if not views and ask.scene is not None:
-        scene = load_scene(ask.scene, ask.images)
-        views = split_scene(scene).protocol == "named" or (found.settings and _used(path, scene))
+        _, known = _split(load_scene(ask.scene, ask.images), found, ask, path, train)
+        views = not known.startswith("guessed")
     of = f"the original 3DGS; one of {', '.join(PRESETS)}{f', got {found.tool!r} in the file' if found.tool else ''}"
     needs = {
         "--scene SCENE": ("its folder", ask.scene),

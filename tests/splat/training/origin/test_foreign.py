@@ -266,6 +266,11 @@ def test_views_that_nothing_names_are_asked_for(folder):
         guess_views=False,
         trained_by=OURS,
     )
+    path = stored(folder / "m/point_cloud/iteration_50/point_cloud.ply", path.read_bytes())
+    stored(folder / "m/cfg_args", b"Namespace(sh_degree=0)")
+    stored(folder / "m/cameras.json", json.dumps([{"img_name": "view_000"}]).encode())  # one that is held out
+    asked = {"scene": folder / "scene", "guess_views": False, "trained_by": "graphdeco"}
+    refused("expected --views 3 ", opened, path, **asked)
 
 
 @pytest.mark.parametrize(
