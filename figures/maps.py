@@ -165,7 +165,9 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
         _show(axes["zero"], maps["zero"], f"Render: loss {quantity(end.losses[1])}")
         _show(axes["minus"], maps["minus"], f"A step of {step} back: loss {back}")
         _show(axes["plus"], maps["plus"], f"A step of {step} forth: loss {forth}")
-        show_scaled(axes["difference"], maps["difference"], end.difference, "Forth less back", end.difference.unit)
+        show_scaled(
+            axes["difference"], maps["difference"], end.difference, "Render forth minus back", end.difference.unit
+        )
         for picture, shift in ((axes["view"], (0, 0)), (axes["photograph"], (left, top))):
             for carrier in reversed(end.carriers):  # the first above the others
                 picture.add_patch(_outline(carrier, shift, _colour(carrier, end)))

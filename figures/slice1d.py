@@ -107,8 +107,10 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: FiniteProbe) -> None:
     axes.set_xlabel(f"step along {along.name}, {along.scale}")
     axes.set_ylabel("curvature (loss per squared step)")
     axes.grid(True)
-    seen = f"{extent(values[sure] / exact)} times the curvature" if sure.any() and exact else "hidden by round-off"
-    axes.set_title(f"At finite steps {seen}\n(bars: round-off)", loc="left")
+    seen = "hidden by round-off\n("
+    if sure.any() and exact:
+        seen = f"{extent(values[sure] / exact)} times the curvature\n(steps of {extent(steps[sure])}; "
+    axes.set_title(f"At finite steps {seen}bars: round-off)", loc="left")
 
 
 def _limits(exact: float, values: np.ndarray, bounds: np.ndarray) -> tuple[float, float]:

@@ -1,9 +1,9 @@
 """Figure: the two cross-sections of a slice, each under what it found, and the plane between them.
 
 Sections: the loss, from true renders; blue dots where the order of the splats or the set of visible ones is not the centre's,
-if it is so at some only; dashed: the quadratic model.  Their titles compare second differences of the loss with the model's at
-all steps.  They share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes count
-steps in curvature units: steps within which the curvature alone changes the loss by the amount named.
+if it is so at some only; dashed: the quadratic model.  Their titles compare second differences of the loss with the model's,
+and name the steps.  They share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes
+count steps in curvature units: steps within which the curvature alone changes the loss by the amount named.
 
 Plane: three contours of the loss and, dashed, of the model at the same levels, those of the colour bar's ticks; grey dots:
 renders; grey: no finite loss; crosses: the checkpoint (upright), and where the plane leads.  Where too few points are renders
@@ -84,14 +84,14 @@ def finding(direction: Direction, change: np.ndarray, model: np.ndarray | None) 
         return f"{along} curves as its curvature says"
     turned = np.sign(lines[0][centre + steps[-1] * np.array([-1, 1])]) == (-1 if up else 1)
     away = f"{'falls' if up else 'rises'} on {'both sides' if turned.all() else 'one side'}"
+    units = direction.steps[centre + steps] / direction.unit
     if held:
-        units = rough(float(direction.steps[centre + steps[held - 1]] / direction.unit))
         rest = away if ratios[-1] < 0 else f"{extent(ratios[held:])} times as much"
-        return f"{along} curves as its curvature says to {units} units, then {rest}"
+        return f"{along} curves as its curvature says to {rough(float(units[held - 1]))} units, then {rest}"
     if ratios.max() < 0:
         return f"{along} {away}, against its curvature"
     way = "" if ratios.min() < 0 else " up" if up else " down"
-    return f"{along} curves{way} {extent(ratios)} times what its curvature says"
+    return f"{along} curves{way} {extent(ratios)} times what its curvature says, at {extent(units)} units"
 
 
 def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
@@ -163,10 +163,9 @@ def _legend(field: Plane) -> list[Line2D]:
         size = "unbounded" if field.error is None else f"<{rough(100 * field.error)}%"
         words = f"plane: {field.evaluated.mean():.0%} rendered,\nelse interpolated (error {size})"
         handles.append(Line2D([], [], label=words, **{**FAINT, "markersize": 4}))
-    if field.crossed is not None and field.crossed.any():
+    if field.crossed is not None and any(_crossed(field, axis).any() for axis in (0, 1)):
         words = f"order changed: {field.crossed.sum():,}\nof {field.evaluated.sum():,} renders"
-        look = CROSSED if any(_crossed(field, axis).any() for axis in (0, 1)) else {"linestyle": "none"}
-        handles.append(Line2D([], [], label=words, **{**look, "markersize": 6}))
+        handles.append(Line2D([], [], label=words, **{**CROSSED, "markersize": 6}))
     if field.model is not None:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
     handles.append(Line2D([], [], linestyle="none", label=f"1 curvature unit:\nΔL = {quantity(field.loss_scale)}"))

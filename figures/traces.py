@@ -2,8 +2,8 @@
 
 Traces have the units of their attributes, so they do not compare.  What is drawn is s^2 tr / 2 as a share of the loss: the mean
 change of the loss by curvature when every parameter of the attribute moves by +-s at random, s the length of the optimiser's
-first step; a diamond where renders of such steps have it.  Of a record without s the traces themselves are drawn, and the title
-says that they do not compare.
+first step; an orange diamond where renders of such steps have it.  Of a record without s the traces themselves are drawn, and
+the title says that they do not compare.
 
 Magnitudes are on a logarithmic axis; the sign is in the marker (filled circle: positive; open square: negative; open
 diamond: the interval does not decide it).  An arrow at the left edge is a zero, or an interval that reaches 0.
@@ -34,6 +34,7 @@ SIGNS: dict[str, dict[str, Any]] = {
     "zero": {"color": UNDETERMINED, "marker": "<", "markerfacecolor": UNDETERMINED},
     "undetermined": {"color": UNDETERMINED, "marker": "D", "markerfacecolor": "white"},
 }
+RENDERED: dict[str, Any] = {"color": ORANGE, "marker": "D", "linestyle": "none", "markersize": 4}
 
 
 def draw(record: Record[ProbeRecord]) -> Figure:
@@ -50,14 +51,15 @@ def draw(record: Record[ProbeRecord]) -> Figure:
             rises = {name: abs(rise) / loss for name, (rise, _) in rendered.items()}
             _draw_traces(axes, {name: scaled(entry, shares[name]) for name, entry in entries.items()},
                          {name: shares[name] * np.asarray(found) for name, found in samples.items()}, rises)  # fmt: skip
-            axes.set_xlabel(
-                "change of the loss by one random step as long as the\noptimiser's first (share): by curvature; ◆ rendered"
-            )
+            axes.set_xlabel("share by which the loss changes in a random step\nas long as the optimiser's first")
         else:
             _draw_traces(axes, entries, samples)
             axes.set_xlabel("|trace|; rows have units of their own\nand do not compare")
         figure.suptitle(_title(record.data), x=0.02, ha="left", fontsize=7.5)
-        figure.legend(handles=_legend(entries), loc="outside lower center", ncols=3, handletextpad=0.2, columnspacing=1)
+        handles = _legend(entries, by="by curvature" if shares else "")
+        if shares and record.data.step_rises:
+            handles.append(Line2D([], [], label="rendered", **RENDERED))
+        figure.legend(handles=handles, loc="outside lower center", ncols=3, handletextpad=0.2, columnspacing=1)
     return figure
 
 
@@ -89,7 +91,7 @@ def _draw_traces(
     magnitudes = [abs(n) for n in (*(e.value for e in entries.values()), *rendered.values()) if _drawable(n)]
     left = _logarithmic(axes, magnitudes)
     for row, (name, entry) in enumerate(entries.items()):
-        axes.plot([rendered.get(name, math.nan)], [row], "D", color=ORANGE, markersize=4, zorder=6)
+        axes.plot([rendered.get(name, math.nan)], [row], **RENDERED, zorder=6)
         look = SIGNS[_sign(entry)]
         drawn = np.abs(samples.get(name, np.empty(0)))
         axes.plot(drawn, np.full(len(drawn), row), "|", color=look["color"], alpha=0.35, markersize=6, zorder=1)
@@ -140,11 +142,13 @@ def _drawable(number: float | None) -> TypeGuard[float]:
     return number is not None and math.isfinite(number) and number != 0
 
 
-def _legend(entries: dict[str, Trace]) -> list[Line2D]:
+def _legend(entries: dict[str, Trace], by: str) -> list[Line2D]:
+    """by: of what the marks are; they are told apart by the signs where not all are positive."""
     present = {_sign(entry) for entry in entries.values()}
     if present == {"positive"}:
-        return []
-    return [Line2D([], [], linestyle="none", label=sign, **look) for sign, look in SIGNS.items() if sign in present]
+        return [Line2D([], [], linestyle="none", label=by, **SIGNS["positive"])] if by else []
+    labels = {sign: f"{by}, {sign}".removeprefix(", ") for sign in SIGNS if sign in present}
+    return [Line2D([], [], linestyle="none", label=words, **SIGNS[sign]) for sign, words in labels.items()]
 
 
 if __name__ == "__main__":

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from splat.training.methods.methods import METHODS
+from splat.training.origin.presets import PRESETS
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "notebooks/results/README.md")]
 PAGES += sorted((ROOT / "docs").glob("*.md"))
@@ -39,6 +42,14 @@ def test_the_readme_is_short_and_every_page_and_notebook_is_listed():
     assert (
         listed == {path.name for path in (ROOT / "docs").iterdir() if path.suffix in (".md", ".ipynb")} >= {*notebooks}
     )
+
+
+def test_every_trainer_and_every_method_has_a_row_on_its_page():
+    pages = {"other-tools": PRESETS, "methods": METHODS}
+    rows = {
+        page: re.findall(r"^\|(.*)", (ROOT / f"docs/{page}.md").read_text(encoding="utf-8"), re.M) for page in pages
+    }
+    assert not [name for page, names in pages.items() for name in names if f"`{name}`" not in "".join(rows[page])]
 
 
 def said(path: Path) -> list[str]:

@@ -202,9 +202,10 @@ def _parsed(arguments: Sequence[str]) -> tuple[Command, Any]:
                 )
         except SystemExit as ended:
             if not ended.code:
-                print(LPIPS if name == "train" else "")
+                if name == "train":
+                    print(LPIPS)
                 raise
-        box = DRAWN.sub("", said.getvalue()).strip()
+        box = DRAWN.sub("", said.getvalue()).strip().replace("'None', ", "")  # what leaving an option out means
         told = (match.expand(words) for pattern, words in SENTENCES.items() if (match := re.search(pattern, box, re.S)))
         raise InputError(f"{next(told)}; landscape {name} --help has all options, and an example")
     if name in ("-h", "--help"):

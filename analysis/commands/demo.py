@@ -1,4 +1,4 @@
-"""`landscape demo`: make a synthetic scene, train on three of its views, probe the result, say what to open; or go on with one.
+"""`landscape demo`: make a synthetic scene, train on three of its views, probe the result; or go on with one.
 
 OUT/scene    the scene (`splat.scenes.synthetic`) as transforms.json with pictures
 OUT/run      the training, and in OUT/run/probe the record of the probe
@@ -29,7 +29,6 @@ def run_demo(options: DemoOptions) -> int:
     out = free_folder(options.out)
     if out != options.out:
         say(f"{options.out} exists, so this run goes to {out}")
-    say("the first run compiles the kernels, which takes about a minute; later runs find them in a cache")
     if not (out / "scene").exists():
         with Console(stderr=True).status("making a synthetic scene"):
             write_transforms_scene(synthetic_scene(SCENE).scene, out / "scene")
@@ -43,9 +42,7 @@ def run_demo(options: DemoOptions) -> int:
         return code
     typed = ["probe", str(checkpoint)]
     _announce(typed)
-    code = run_probe(ProbeOptions(checkpoint), ["landscape", *typed])
-    say(f"open the report in a browser; next: landscape map {shlex.quote(str(run))}, or view in place of map")
-    return code
+    return run_probe(ProbeOptions(checkpoint), ["landscape", *typed])
 
 
 def _announce(arguments: list[str]) -> None:

@@ -67,9 +67,8 @@ def describe(error: BaseException) -> tuple[int, str]:
 def report(error: BaseException, command: Sequence[str], debug: bool = False) -> int:
     """Say what went wrong on stderr; returns the exit code.  debug: with the traceback, whatever the error is."""
     code, sentence = describe(error)
-    before, lacks, words = sentence.rpartition("; add --")
-    if lacks:  # the whole command
-        sentence = f"{before}; take: {shlex.join(command)} --{words}"
+    if lacking := getattr(error, "__notes__", []):  # options that the command needs: the whole command
+        sentence = f"{sentence}; take: {' '.join([shlex.join(command), *lacking])}"
     if debug or code == BUG:
         traceback.print_exception(error)
     if code == BUG:

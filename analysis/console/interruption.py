@@ -1,12 +1,13 @@
 """Ctrl-C, a scheduler's SIGTERM, a terminal that closes: a flag, at which long work looks between its stages and steps.
 
-Where nobody listens, and while libraries are loaded, a signal ends the process: what it writes is written whole or not at all.
+Where nobody listens a signal ends the process: what it writes is written whole or not at all.
 """
 
 import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from threading import Event, current_thread, main_thread
 from types import FrameType
 from typing import Any
@@ -69,13 +70,26 @@ def look() -> None:
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Load libraries in the block: there a signal ends the process, as their C code drops Python's exceptions, and pycolmap
-    handles SIGTERM itself."""
-    before = _handle(dict.fromkeys(SIGNALS, signal.SIG_DFL)) if current_thread() is main_thread() else {}
+    """Load libraries in the block: there a signal ends the process at once, in a line, as their C code drops Python's
+    exceptions, and pycolmap handles SIGTERM itself."""
+
+    def end(number: int, _: FrameType | None) -> None:
+        with suppress(OSError):
+            os.write(2, f"landscape: {Interrupted(number)}\n".encode())
+        os._exit(Interrupted(number).exit_code)
+
+    before = _handle(dict.fromkeys(SIGNALS, end)) if current_thread() is main_thread() else {}
     try:
         yield
     finally:
         _handle(before)
+
+
+def command() -> None:
+    """The `landscape` program: a signal is told in a line also while its commands are loaded."""
+    with loading():
+        cli = import_module("analysis.commands.cli")
+    cli.command()
 
 
 def _handle(handlers: dict[signal.Signals, Any]) -> dict[signal.Signals, Any]:

@@ -24,11 +24,11 @@ def pace(done: int, seconds: float) -> str:
     """The rate of a stage in words, after so many units in so many seconds; empty where that is not known yet.
 
     >>> pace(20, 10.0), pace(1, 130.0), pace(0, 5.0)
-    (', 2 a second', ', 130 s each', '')
+    (', 2 a second', ', 130 s each so far', '')
     """
     if not done or seconds <= 1:
         return ""
-    return f", {done / seconds:.2g} a second" if done >= seconds else f", {seconds / done:.3g} s each"
+    return f", {done / seconds:.2g} a second" if done >= seconds else f", {seconds / done:.3g} s each so far"
 
 
 class Stages:
@@ -78,7 +78,7 @@ class Stages:
         def report(done: int, most: int, state: str) -> None:
             look()
             spent = perf_counter() - start
-            words = f"{done} of at most {most}{pace(done, spent)}"
+            words = f"{done} of at most {most} done{pace(done, spent)}"
             self._progress.update(task, completed=done, total=most, state=f"{words}; {state}")
             if perf_counter() - self._said > NOW_AND_THEN:
                 self._say(f"{name}: {words}")

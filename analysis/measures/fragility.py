@@ -125,9 +125,8 @@ def fragility_sentences(found: Fragility) -> list[str]:
         position += f" The gradient along the rays is {quantity(found.depth_gradient)} times that across them."
     rotation, scale = (percent(found.needles_steepest[name]) for name in ATTRIBUTES)
     conditioning = (
-        f"Conditioning: {percent(found.needles)} of the Gaussians are needles (condition above {NEEDLE:.0f}, longer than "
-        f"{sqrt(NEEDLE):.0f} : 1); so are {rotation} of the "
-        f"{STEEPEST:.0%} that are steepest in rotation, and {scale} in scale."
+        f"Conditioning: {percent(found.needles)} of the Gaussians are needles, longer than {sqrt(NEEDLE):.0f} : 1 in a "
+        f"picture; so are {rotation} of the {STEEPEST:.0%} that are steepest in rotation, and {scale} in scale."
     )
     opacity = f"Opacity: {percent(found.one_view)} of the Gaussians have over {ALONE:.0%} of their weight in one view"
     if found.one_view_trace is not None:

@@ -27,13 +27,14 @@ from analysis.measures.memory import expected_peak, size_of
 from analysis.measures.units import optimiser_units, step_lengths
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
-from analysis.probe.plan import expected_seconds, seconds_of_render
+from analysis.probe.plan import compiles, expected_seconds, seconds_of_render
 from analysis.probe.record import probe_arrays, probe_record
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.views import write_views
 from analysis.records.page.summary import guess, remarks, steps_made, summary
 from analysis.records.provenance import provenance_of, require_seed
 from analysis.records.records import Arrays, ProbeRecord, record_folder, require_replaceable
+from analysis.records.run_files import CHECKPOINT
 from analysis.records.tables import family_table, probe_table
 from landscape import EigenEnds
 from landscape.errors import InputError
@@ -111,6 +112,9 @@ def _run(
         if not found.unreached:
             shutil.rmtree(unfinished, ignore_errors=True)
         conclude(data, out, options.verbose, guessed)
+        of = options.checkpoint.parent if options.checkpoint.name == CHECKPOINT else options.checkpoint
+        more = " and the same options on its tool and scene" if checkpoint.origin else ""
+        say(f"next: open the report in a browser; landscape map {shlex.quote(str(of))}{more}")
     failed = any(check.passed is False for check in data.checks.values())
     return CHECK_FAILED if options.strict and failed else 0
 
@@ -218,7 +222,8 @@ def _expected(objective: SceneObjective, settings: ProbeSettings, further: float
     peak = expected_peak(objective)
     objective.loss(objective.active.flat)  # untimed, as the kernels may compile
     seconds = expected_seconds(settings, seconds_of_render(objective), further)
-    return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
+    more = ", plus compiling, once" if compiles(objective.active.flat.device) else ""
+    return f"about {seconds:,.0f} s, roughly{more}, and {peak / 1e9:.1f} GB of memory"
 
 
 def conclude(data: ProbeRecord, out: Path, verbose: bool, guessed: Sequence[str]) -> None:

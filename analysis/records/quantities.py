@@ -79,14 +79,13 @@ def extent(values: Iterable[float], words: Callable[[float], str] = rough) -> st
 
 
 def solved(value: float | None, residual: float | None) -> str:
-    """`rough` of an eigenvalue, with the solver's residual where two digits do not hide it.
+    """`measured` of an eigenvalue, whose error is the solver's residual: the digits that tables have.
 
     >>> [text.replace(HARD, " ") for text in (solved(27.438, 1e-5), solved(-0.17, 0.02), solved(1.0, None))]
-    ['27', '−0.17 ± 0.020 (solver)', '1.0 ± ? (solver)']
+    ['27.4', '−0.170 ± 0.020 (solver)', '1.00 ± ? (solver)']
     """
-    if value is None or residual == 0 or (residual is not None and residual < 0.005 * abs(value)):
-        return rough(value)
-    return f"{rough(value)}{PLUS_MINUS}{'?' if residual is None else rough(residual)} (solver)"
+    text = measured(value, residual)
+    return f"{text} (solver)" if PLUS_MINUS in text else text
 
 
 def measured(value: float | None, error: float | None) -> str:

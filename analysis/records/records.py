@@ -103,7 +103,7 @@ Shapes = dict[str, dict[str, list[Count]]]
 
 
 BOTH_ENDS = ("eigenvalue_ratio", "negative_ratio")
-DOUBTED = schema.Index(value=None, low=None, high=None, note="renders do not confirm an end")
+DOUBTED = schema.Index(value=None, low=None, high=None, note="renders do not confirm λ max or λ min")
 
 
 class ProbeRecord(Struct, kw_only=True):

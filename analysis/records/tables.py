@@ -110,10 +110,8 @@ def _end_rows(data: ProbeRecord) -> Iterator[Row]:
             value, about = UNDETERMINED, f"at {value} so far; {about}"
         yield ENDS[name], value, about
     if where := data.eigenvalues.max.lives_on:
-        among = (
-            f"{where.needle_count:,} of {data.counts.visible_gaussians:,} Gaussians in sight, of the steepest direction"
-        )
-        yield "share on needles", percent(where.needles), among
+        among = f"which {where.needle_count:,} of the {data.counts.visible_gaussians:,} Gaussians in sight are"
+        yield "share of e₁ on needles", percent(where.needles), among
     for name, of in (("max", "e₁"), ("min", "eₘᵢₙ")):
         if where := getattr(data.eigenvalues, name).lives_on:
             yield f"Gaussians that {of} is spread over", rough(where.participation), ""

@@ -112,10 +112,10 @@ def find_directions(
         vectors = random_directions(center, groups, generators[kind], count)
         return [Direction(kind, f"r{'₁₂'[i]}", vectors[:, i], scale="share of the size") for i in range(count)]
     if kind == "gradient":
-        return [Direction(kind, "gradient", gradient_direction(objective.gradient)[:, 0])]
+        return [Direction(kind, "the gradient", gradient_direction(objective.gradient)[:, 0])]
     vectors = torch.cat([line_between(center, other) for other in others], dim=1)
     orthonormal(vectors)  # refuses three checkpoints on one line
-    names = ["line"] if len(others) == 1 else ["line₁", "line₂"]
+    names = ["the line"] if len(others) == 1 else ["line₁", "line₂"]
     return [Direction(kind, name, vectors[:, i], scale="share of the way") for i, name in enumerate(names)]
 
 

@@ -121,10 +121,19 @@ class TrainingProgress:
         if not self.console.is_terminal:
             steps, time = step - self.begun[0], seconds - self.begun[1]
             left = f", about {time / steps * (total - step):.0f} s left" if steps and step < total else ""
-            words = (
-                f"step {step} of {total}: loss {loss:.4f}, {ratio:.2f} dB, {gaussians} Gaussians, {seconds:.0f} s{left}"
-            )
+            words = f"step {step} of {total}: loss {loss:.4f}, {ratio:.2f} dB of the first training view"
+            words += f"{self._after(step)}, {gaussians} Gaussians, {seconds:.0f} s{left}"
             self.console.print(words, soft_wrap=True, highlight=False)
+
+    def _after(self, step: int) -> str:
+        """What was done to the Gaussians since the row before, besides steps: after it the image fits worse."""
+        config, since = self.training.config, range(max(step - (step % self.every or self.every), 0) + 1, step + 1)
+        control, total, white = config.method.density_control(config), config.iterations, config.is_white
+        done = {
+            "density control": any(control.densifies(n, total) for n in since),
+            "a reset of opacities": any(control.resets_opacity(n, total, white=white) for n in since),
+        }
+        return f" after {' and '.join(name for name in done if done[name])}" if any(done.values()) else ""
 
 
 @torch.no_grad()

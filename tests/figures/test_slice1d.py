@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
+from analysis.records.quantities import rough
 from figures import make_all, slice1d, slice2d
 from figures.style import BLACK, BLUE, SKY, VERMILION
 from tests.figures.test_figures import require_layout
@@ -42,10 +43,10 @@ def test_the_titles_name_the_direction_and_say_how_the_loss_curves_beside_the_cu
     center = data["slice"]["center_loss"]
     arrays["slice"]["loss"] = center + 3 * (arrays["slice"]["model"] - center)
     above, below = (axes.get_title(loc="left") for axes in slice1d.draw(written(tmp_path / "slice", data, arrays)).axes)
-    assert (
-        above == f"Along {data['slice']['directions'][0]['name']} the loss curves up 3.0 times what its\ncurvature says"
-    )
-    assert below == "At finite steps 1.0 to 1.8 times the curvature\n(bars: round-off)"
+    name, said = data["slice"]["directions"][0]["name"], "what its\ncurvature says, at 0.15 to 1.5 units"
+    assert above == f"Along {name} the loss curves up 3.0 times {said}"
+    steps = f"{rough(1e-5)} to {rough(1e-3)}"
+    assert below == f"At finite steps 1.0 to 1.8 times the curvature\n(steps of {steps}; bars: round-off)"
 
 
 def test_dots_are_renders_and_the_blue_ones_are_crossed(tmp_path):

@@ -37,8 +37,7 @@ FILE, SPLATS = "report.html", "view.html"  # in the record's folder, and beside 
 FINE, COARSE = 82, 60  # quality of WebP: of drawings, and of maps, which are noisy
 EFFORT = 2  # of its encoder, 0 to 6
 PICTURES = {
-    "slice2d": "The loss on the plane of the two steepest directions. Dots: renders, blue where the order of the splats or the "
-    "set of visible ones is not the checkpoint's; dashed: the quadratic model.",
+    "slice2d": "The loss on the plane of the two steepest directions, along each of them and over both.",
     "surface": "The same plane as a surface.",
     "spectrum": "The density of the spectrum, broadened; the share of all directions and of all curvature below a value; the "
     "eigenvalues that the search for the extreme ones met, each with the residual within which a true one lies.",
@@ -46,8 +45,8 @@ PICTURES = {
     "traces": "The trace of each attribute's block of the Hessian, in units of its own: the rows do not compare.",
 }
 COMPARED = (  # of the traces, where the record has these steps
-    "What a random step as long as the optimiser's first changes of the loss by each attribute's curvature, which "
-    "compares; beside the names their traces, each in its own unit."
+    "By how much of itself the loss changes in a random step as long as the optimiser's first, which compares; beside the "
+    "names their traces, each in its own unit."
 )
 PIXEL = "1 px along the ray: a way as long as the one that moves a splat by a pixel where it is across the ray."
 GLOSSARY = {  # of the words that a page uses
@@ -69,7 +68,7 @@ GLOSSARY = {  # of the words that a page uses
     "start vector": "random vector from which the density is made; each gives an estimate of its own",
     "order changed": "some splats lie in another order along their rays than in the checkpoint, which derivatives do not see",
     "matvec budget": "largest number of products of the Hessian with a vector that a search may use",
-    "condition": "of a splat: its longer axis in the picture over the shorter one, squared; above 100 it is a needle",
+    "condition": "of a splat: its longer axis in the picture over the shorter one, squared; above 100, 10 : 1, it is a needle",
     "in sight": "drawn in a training view",
     "the paper": "Zhao et al., “Geometric Probing for Isotropic Optimization Manifold in Sparse-View 3D Gaussian Splatting” "
     "(StableGS)",

@@ -1,8 +1,9 @@
 """A probe in ten lines, for the terminal, and what has to be said beside them.
 
-Attributes come first: where errors decide their order, three seeds of fern share it.  Numbers have two digits; the errors
-beside them are named.  "one training": what another seed changes (half of fern's curvature lies in 15 to 28 directions, or in
-35 to 45).  Where a check of the derivatives failed, no number that is made of them stands here.
+Attributes come first: where errors decide their order, three seeds of fern share it.  Eigenvalues have three digits, as in
+every table, other numbers two; the errors beside them are named.  "one training": what another seed changes (half of fern's
+curvature lies in 15 to 28 directions, or in 35 to 45).  Where a check of the derivatives failed, no number that is made of them
+stands here.
 """
 
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from analysis.records.findings import Line, changes_by_steps, findings, is_loose, largest_steps
-from analysis.records.quantities import UNDETERMINED, apart, percent, rough, solved
+from analysis.records.quantities import UNDETERMINED, apart, percent, quantity, rough, solved
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import Eigenvalue
 
@@ -100,9 +101,9 @@ def _end(end: Eigenvalue) -> str:
     if renders and renders.optimiser_step and (value > 0 or renders.confirmed):
         at = renders.at_step
         over = "hidden by round-off" if at is None else rough(at * value)
-        kinks = f", of it about {rough(renders.kinks)} by kinks of L1" if renders.kinks else ""
-        notes.insert(0, f"{over} over the optimiser's step{kinks}")
-    text = f"{solved(value, end.residual)}{apart(end.views_error)} ({', '.join(notes)})"
+        kinks = f", which see kinks of L1 too, about {rough(renders.kinks)} at short steps" if renders.kinks else ""
+        notes.insert(0, f"{over} over the optimiser's step in renders{kinks}")
+    text = f"{solved(value, end.residual)}{apart(end.views_error)} ({'; '.join(notes)})"
     return f"{text}{_carrier(end)}; {_rendered(end)}"
 
 
@@ -118,9 +119,7 @@ def _carrier(end: Eigenvalue) -> str:
     text = f": {percent(carrier.share)} on Gaussian {carrier.gaussian:,} {random}, {shape}{MOVED[carrier.attribute]}"
     if carrier.wide:
         place, value, _ = carrier.wide
-        return (
-            f"{text}; number {place} from this end ({rough(value)}) is the first eigenvector on more than ten Gaussians"
-        )
+        return f"{text}; number {place} from this end ({quantity(value)}) is the first eigenvector on more than ten Gaussians"
     if carrier.found < 2:
         return text
     return f"{text}; each of the first {carrier.found} eigenvectors from this end lies on at most ten Gaussians"
@@ -131,7 +130,8 @@ def _rendered(end: Eigenvalue) -> str:
     if not renders:
         return "not rendered"
     if renders.confirmed:
-        return f"renders agree within a factor of 2 from {rough(renders.low)} to {rough(renders.high)}"
+        last = ", the longest tried" if renders.high == renders.steps[-1] else ""
+        return f"renders agree within a factor of 2 at steps of {rough(renders.low)} to {rough(renders.high)}{last}"
     if renders.confirmed is None:
         return "not resolved: round-off hides it in renders"
     value, why = end.value or 0.0, ""

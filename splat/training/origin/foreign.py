@@ -85,7 +85,8 @@ def foreign_training(
 
 
 def _require_said(found: SplatFile, ask: Foreign, path: Path, train: Sequence[str] | None) -> None:
-    """InputError that names all that is neither asked for nor said by the file, or by what lies beside it."""
+    """InputError that names all that is neither asked for nor said by the file, or by what lies beside it; its notes: the
+    options that say it."""
     asked = (ask.train_list, ask.guess_views, train is not None, ask.views is not None)
     views = any((*asked, found.train, "eval" in found.settings))
     if not views and ask.scene is not None:
@@ -102,9 +103,9 @@ def _require_said(found: SplatFile, ask: Foreign, path: Path, train: Sequence[st
     }
     if lacking := {words: about for words, (about, said) in needs.items() if not said}:
         what = " and ".join(f"{words} ({about})" for words, about in lacking.items())
-        raise InputError(
-            f"expected {what} for {path}, as neither it nor a file beside it says so, got none; add {' '.join(lacking)}"
-        )
+        error = InputError(f"expected {what} for {path}, as neither it nor a file beside it says so, got none")
+        error.add_note(" ".join(lacking))
+        raise error
 
 
 def _scene(found: SplatFile, ask: Foreign, preset: Preset) -> tuple[Scene, str | None, float]:

@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from landscape.errors import InputError
+from landscape.errors import InputError, did_you_mean
 from splat.losses.reference import LossSettings
 from splat.model.settings import Antialias, RenderSettings
 
@@ -106,6 +106,6 @@ def preset_of(said: str | None, asked: str | None) -> tuple[str, str]:
     if (name := asked or said or "nothing") in PRESETS:
         return name, "asked for" if asked else "the file"
     raise InputError(
-        f"expected --trained-by with one of {', '.join(PRESETS)}, whose conventions to follow, got {name}; of the original "
-        "3DGS: graphdeco"
+        f"expected --trained-by with one of {', '.join(PRESETS)}, whose conventions to follow, got {name}"
+        f"{did_you_mean(name, PRESETS) or '; of the original 3DGS: graphdeco'}"
     )

@@ -25,7 +25,10 @@ def test_the_demo_makes_a_scene_trains_probes_and_says_what_to_open(small, tmp_p
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "compiles the kernels" in said and str(out / "run" / "probe" / "report.html") in said
+    assert (
+        f"next: open the report in a browser; landscape map {out / 'run'}\n" in said
+        and str(out / "run" / "probe" / "report.html") in said
+    )
     assert f"$ landscape probe {out / 'run' / 'checkpoint.pt'}" in said and "exists" not in said
     assert sorted(path.name for path in out.iterdir()) == ["run", "scene"]
     assert load_checkpoint(out / "run" / "checkpoint.pt").training.step == 12
@@ -65,7 +68,7 @@ def test_an_interrupted_demo_is_continued_where_it_was(small, tmp_path, capsys, 
         assert step is None or load_checkpoint(out / "run" / "checkpoint.pt").training.step == step
     capsys.readouterr()
     assert main(["demo", "--out", str(out)]) == 0
-    assert f"next: landscape map {out}/run" in capsys.readouterr().out
+    assert "$ landscape probe" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["demo", "whole"]
     flat, other = (load_checkpoint(each / "run" / "checkpoint.pt").training.gaussians.flat for each in (out, whole))
     assert torch.equal(flat, other) and probed == [each / "run" / "checkpoint.pt" for each in (whole, out)]

@@ -52,7 +52,9 @@ def test_one_sentence_for_what_is_no_fault_of_the_program(monkeypatch, capsys, e
 
 
 def test_what_a_command_lacks_is_added_to_it(monkeypatch, capsys):
-    code, said = ended(monkeypatch, capsys, InputError("expected --views N, got none; add --views 3"))
+    error = InputError("expected --views N, got none")
+    error.add_note("--views 3")
+    code, said = ended(monkeypatch, capsys, error)
     assert (code, said) == (2, "landscape: expected --views N, got none; take: landscape demo --views 3\n")
 
 

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -45,7 +46,7 @@ def test_signals_that_are_ignored_stay_so():
 
 
 @pytest.mark.parametrize("kind", SIGNALS)
-def test_a_signal_ends_a_program_that_loads_libraries_and_importing_ours_leaves_them_as_they_were(kind):
+def test_a_signal_ends_a_program_that_loads_libraries_in_a_line_and_importing_ours_leaves_them_as_they_were(kind):
     """But for SIGTERM, which pycolmap takes, and `loading` gives back."""
     program = (
         "import os, signal\nfrom analysis.console.interruption import SIGNALS, loading\n"
@@ -54,4 +55,20 @@ def test_a_signal_ends_a_program_that_loads_libraries_and_importing_ours_leaves_
         f"with loading():\n    os.kill(os.getpid(), {int(kind)})\nprint('not ended')"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (-kind, "", "")
+    said = f"landscape: interrupted by {kind.name}\n"
+    assert (done.returncode, done.stdout, done.stderr) == (128 + kind, "", said)
+
+
+def test_a_signal_that_comes_while_the_commands_are_loaded_is_told_in_a_line(monkeypatch, capfd):
+    """The program is what pyproject.toml names."""
+    name = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]["landscape"]
+    module, _, function = name.partition(":")
+    program = (
+        "import os, sys, importlib.abc\n"
+        "class Press(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, *_):\n"
+        f"        if name == 'tyro': os.kill(os.getpid(), {int(signal.SIGINT)})\n"
+        f"sys.meta_path.insert(0, Press())\nfrom {module} import {function}\n{function}()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "landscape: interrupted by SIGINT\n")

@@ -169,7 +169,7 @@ def test_the_summary_says_of_both_ends_what_renders_say_and_who_carries_them(rec
         assert end.carrier.gaussian == int(dense[0].mask.nonzero()[mass, 0])
         assert " of " in end.carrier.shape
         agree = {
-            True: "renders agree within a factor of 2 from",
+            True: "renders agree within a factor of 2 at steps of",
             False: "not confirmed by renders",
             None: "not resolved",
         }

@@ -71,7 +71,7 @@ def test_a_check_that_failed_leaves_no_number_that_it_puts_in_doubt():
 @pytest.mark.parametrize(
     ("confirmed", "ratio", "said"),
     [
-        (True, 1.5, "renders agree within a factor of 2 from 0.0010 to 0.0040"),
+        (True, 1.5, "renders agree within a factor of 2 at steps of 0.0010 to 0.0040, the longest tried"),
         (False, -1.5, "not confirmed by renders, by which it is 330 over the optimiser's step: no saddle is claimed"),
         (None, 1.5, "not resolved: round-off hides it in renders"),
     ],
@@ -87,8 +87,8 @@ def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, wide):
         "random_share": 0.002, "found": 10, **wide,
     }  # fmt: skip
     lines = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))
-    over = ", one training" if not confirmed else "330 over the optimiser's step, one training"
-    assert lines["negative"].startswith("−220 (" + over.removeprefix(", ").replace("330", "−330"))
+    over = "one training" if not confirmed else "330 over the optimiser's step in renders; one training"
+    assert lines["negative"].startswith("−220 (" + over.replace("330", "−330"))
     who = "90% on Gaussian 3,739 (of a random direction 0.2%), a needle, 158 : 1 in the picture, turned; "
     other = "each of the first 10 eigenvectors from this end lies on at most ten Gaussians"
     other = "number 4 from this end (−120) is the first eigenvector on more than ten Gaussians" if wide else other
@@ -143,11 +143,13 @@ def cells(data):
 
 def test_needles_and_finite_steps_have_rows_where_they_are_known():
     data, _ = synthetic()
-    assert not {"share on needles"} & set(cells(data)) and "Finite steps along e₁" not in number_rows(probe_of(data))
+    assert not {"share of e₁ on needles"} & set(cells(data)) and "Finite steps along e₁" not in number_rows(
+        probe_of(data)
+    )
     data["eigenvalues"]["max"]["lives_on"] = {"needles": 0.78, "needle_count": 1, "participation": 1.8}
     data["finite_probe"] = synthetic_line()[0]["finite_probe"] | {"truncation": [1.0, 1.0, 1.0, None]}
     found = cells(data)
-    assert found["share on needles"] == ["78%", "1 of 9,874 Gaussians in sight, of the steepest direction"]
+    assert found["share of e₁ on needles"] == ["78%", "which 1 of the 9,874 Gaussians in sight are"]
     steps = {name: soft(value) for name, (value, _) in found.items() if name.startswith("curvature at ±")}
     # round-off hides the curvature at the first step
     assert list(steps.values()) == ["41.0 ± 4.1", "55.0 ± 1.0", "70.0 ± ?"]

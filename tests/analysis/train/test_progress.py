@@ -1,5 +1,6 @@
 """How a training goes: train.csv, the lines of the terminal, TensorBoard, and the checkpoints that stay."""
 
+import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -121,8 +122,18 @@ def test_off_a_terminal_every_row_is_a_line_with_the_time_left(original, tmp_pat
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("step ")]
     assert [line.split(":")[0] for line in lines] == [f"step {step} of 25" for step in (0, 10, 20, 25)]
     for line, (_, row) in zip(lines, pd.read_csv(tmp_path / "run" / "train.csv").iterrows(), strict=True):
-        assert f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB, {row['gaussians']:.0f} Gaussians" in line
+        fits = f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB of the first training view"
+        assert re.search(rf": {fits}( after .*)?, {row['gaussians']:.0f} Gaussians, ", line)
         assert line.endswith(" s left") == (row["step"] in (10, 20))
+
+
+def test_a_row_says_what_was_done_to_the_gaussians_since_the_one_before(original, tmp_path, capsys):
+    settings = ["start=0", "every=4", "reset_every=11"]  # until half of the 25 steps
+    changes = [word for setting in settings for word in ("--set", f"densify.{setting}")]
+    assert main(words(original, tmp_path / "run", *changes)) == 0
+    lines = re.findall(r"^step \d+ of .*", capsys.readouterr().err, re.M)
+    after = [found[1] if (found := re.search(" after (.*?),", line)) else "" for line in lines]
+    assert after == ["", "density control", "density control and a reset of opacities", ""]
 
 
 def test_gaussians_that_more_than_triple_in_the_first_tenth_are_said_with_the_reason(original, tmp_path, capsys):

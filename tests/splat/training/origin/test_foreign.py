@@ -169,13 +169,11 @@ def test_an_spz_is_read_in_the_axes_in_which_it_looks_like_the_scene(folder):
 @pytest.mark.parametrize(
     ("comments", "ask", "message"),
     [
-        (
-            (),
-            {},
-            r"expected --trained-by graphdeco \(.*; one of graphdeco, gsplat.*\) for .*a\.ply.*; add --trained-by graphdeco$",
-        ),
+        ((), {}, r"expected --trained-by graphdeco \(.*; one of graphdeco, gsplat.*\) for .*a\.ply.*, got none\n"),
         (("trained by someone",), {}, r"expected --trained-by .*, got 'someone' in the file\)"),
-        ((), {"trained_by": "nobody"}, "got nobody"),
+        ((), {"trained_by": "nobody"}, "got nobody; of the original 3DGS: graphdeco"),
+        ((), {"trained_by": "graphdec"}, r"got graphdec; did you mean graphdeco\?"),
+        ((), {"trained_by": "gsplat-1.5"}, r"got gsplat-1.5; did you mean gsplat-1.6\?"),
         ((), {"trained_by": OURS, "scene": None}, "expected --scene SCENE"),
         ((), {"trained_by": OURS, "views": 2, "train_list": Path("views.txt")}, "--views or --train-list"),
         ((), {"trained_by": OURS, "train": ("nothing",)}, "name of one view"),
@@ -285,7 +283,7 @@ def test_views_that_nothing_names_are_asked_for(folder):
 )
 def test_all_that_is_missing_is_said_at_once_with_the_words_that_the_command_lacks(folder, ask, more):
     path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
-    sentence = refused(rf"; add {more}$", opened, path, guess_views=False, **ask)
+    sentence = refused(rf", got none\n{more}$", opened, path, guess_views=False, **ask)
     assert set(re.findall(r"--(?:scene|trained-by|views)\b", sentence)) == set(re.findall(r"--[\w-]+", more))
 
 
