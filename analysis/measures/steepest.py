@@ -21,7 +21,7 @@ over the optimiser's step, where kinks make 13 by the formula.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -35,13 +35,14 @@ from analysis.records.schema import Carries
 from landscape import curvature_reach
 from landscape.slices.finite_probe import WITHIN
 from splat.backend.cpu.threads import single_threaded, thread_count
-from splat.curvature.fields import Values, sight_fields
+from splat.curvature.fields import Values
 from splat.curvature.objective import SceneObjective
 from splat.projection.formulas import lens_of
 from splat.projection.reference import NEEDLE
+from splat.render.autograd import project_by_kernel, rasterize_by_kernel
 from splat.render.backend import backend_of
 from splat.render.render import render
-from splat.render.sight import Sight, sight
+from splat.render.sight import Sight
 from splat.scenes.view import View
 
 NEAR = 0.01  # |residual|, of a range of 1, below which residuals are taken to be spread evenly
@@ -49,6 +50,7 @@ LEAST, MOST = 0.05, 5  # smallest share of the mass of a carrier; most carriers
 RISE = 0.01  # relative change of the loss at the longest step, by the curvature
 STEPS = 7  # each half of the one before; the shortest changes the loss by 2e-6, above round-off
 SIGMAS = 2.0  # standard deviations at which an outline is drawn
+TINY = torch.finfo(torch.float32).tiny
 ROOM, SMALLEST = 1.3, 8  # size of a crop: in outlines; at least 1 / SMALLEST of its view
 VERBS = {"means": "moves", "log_scales": "stretches", "quats": "turns", "opacity_logits": "fades", "sh": "recolours"}
 PLACES = (
@@ -108,11 +110,10 @@ def steepest(
 def heaviest(
     objective: SceneObjective, vectors: Sequence[Float[Tensor, " p"]], generator: torch.Generator
 ) -> list[Carries]:
-    """The Gaussian with most mass in each eigenvector; on the CPU also its shape, in words."""
+    """The Gaussian with most mass in each eigenvector, and its shape, in words."""
     random = masses(torch.empty_like(objective.active.flat).normal_(generator=generator), objective.active)
-    on_cpu = objective.active.flat.device.type == "cpu"
-    sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views] if on_cpu else []
-    values, found = (sight_fields(sights) if on_cpu else {}), []
+    found, weights = [], weights_of(objective)
+    values = {"views": (weights > 0).sum(dim=0), "one_view": weights.amax(dim=0) / weights.sum(dim=0).clamp_min(TINY)}
     for vector in vectors:
         mass = masses(vector, objective.active)
         mass, i = mass / mass.sum(), int(mass.argmax())
@@ -125,12 +126,24 @@ def heaviest(
             random_share=float(random.max() / random.sum()),
             attribute=max(shares, key=shares.__getitem__),
         )
-        if on_cpu:
-            view = objective.views[_view_with_most(sights, i)]
-            carrier = _carrier(objective, view, vector, values, mass, i)
-            one.shape, one.view, one.outline = shape(carrier, view), view.name, carrier.outline
+        view = objective.views[int(weights[:, i].argmax())]
+        carrier = _carrier(objective, view, vector, values, mass, i)
+        one.shape, one.view, one.outline = shape(carrier, view), view.name, carrier.outline
         found.append(one)
     return found
+
+
+def weights_of(objective: SceneObjective) -> Float[Tensor, "m n"]:
+    """The sum of alpha T over the pixels of each view: what one channel of the image's sum changes by with a splat's colour."""
+    found = []
+    for view in objective.views:
+        splats = project_by_kernel(objective.active, view.camera, objective.settings)
+        coloured = replace(splats, colours=splats.colours.detach().requires_grad_())
+        size = view.camera.width, view.camera.height
+        image, _ = rasterize_by_kernel(coloured, objective.background, *size, objective.settings)
+        (changes,) = torch.autograd.grad(image[0].sum(), coloured.colours)
+        found.append(changes[:, 0])
+    return torch.stack(found)
 
 
 def kink_curvature(objective: SceneObjective, vector: Float[Tensor, " p"]) -> float:
@@ -147,8 +160,7 @@ def kink_curvature(objective: SceneObjective, vector: Float[Tensor, " p"]) -> fl
 
 def heaviest_view(objective: SceneObjective, vector: Float[Tensor, " p"]) -> int:
     """Index of the training view in which the Gaussian with most mass in a vector has most weight."""
-    sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views]
-    return _view_with_most(sights, int(masses(vector, objective.active).argmax()))
+    return int(weights_of(objective)[:, masses(vector, objective.active).argmax()].argmax())
 
 
 def _view_with_most(sights: Sequence[Sight], gaussian: int) -> int:
@@ -212,11 +224,11 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
 def _carrier(
     objective: SceneObjective, view: View, vector: Tensor, values: Values, mass: Float64[Tensor, " n"], i: int
 ) -> Carrier:
-    active, index = objective.active, torch.tensor([i])
+    active, index = objective.active, torch.tensor([i], device=vector.device)
     part = active.with_flat(vector).select(index)
     shares = mass_shares(part.flat, part.blocks)
     splats, _, _ = backend_of(active.flat).project(active.select(index), lens_of(view.camera, objective.settings))
-    outline = outline_of(splats[0].double())
+    outline = outline_of(splats[0].double().cpu())
     return Carrier(
         gaussian=int(objective.mask.nonzero()[i, 0]),
         share=float(mass[i]),

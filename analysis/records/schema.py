@@ -176,9 +176,9 @@ class Carries(Struct, kw_only=True):
 
     gaussian: its number among all of the checkpoint.  share: of |v|^2; random_share: the largest that a Gaussian has of a
     random vector.  attribute: that of most mass in it.  shape: kind and place of its splat, in words; view: where it has most
-    weight; outline: its ellipse there, px, in order x, y, half axes, angle; empty where processes share the views or a GPU has
-    them.  found: of the first ten eigenpairs from this end, those that the search found; wide: of
-    these, the first on more than ten Gaussians: place, eigenvalue, participation over Gaussians; absent where there is none.
+    weight; outline: its ellipse there, px, in order x, y, half axes, angle.  found: of the first ten eigenpairs from this end,
+    those that the search found; wide: of these, the first on more than ten Gaussians: place, eigenvalue, participation over
+    Gaussians; absent where there is none.
     """
 
     gaussian: Count

@@ -14,6 +14,7 @@ from analysis.measures.steepest import (
     rendered_sentence,
     sentence,
     steepest,
+    weights_of,
 )
 from analysis.records.quantities import percent
 from splat.curvature.fields import scene_fields
@@ -22,6 +23,7 @@ from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.projection.reference import project
 from splat.render.render import render
+from splat.render.sight import sight
 from tests.splat.curvature.test_fields import scene_of
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import random_gaussians
@@ -189,3 +191,9 @@ def test_the_curvature_of_kinks_is_what_the_hessian_leaves_out_of_losses_at_fini
         said.append(kink_curvature(objective, v))
     assert sum(seen) == pytest.approx(sum(said), rel=0.15) and min(said) > 0
     assert kink_curvature(SceneObjective(gaussians, views, smooth, BACKGROUND), v) == 0.0
+
+
+def test_weights_of_a_view_are_those_of_the_pass_over_its_pixels(shown):
+    objective = shown[0]
+    for view, found in zip(objective.views, weights_of(objective), strict=True):
+        torch.testing.assert_close(found, sight(objective.active, view.camera, objective.settings).weight)

@@ -11,7 +11,7 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 from analysis.measures.depth import depth_rises, depth_split
 from analysis.measures.localization import conditions, localize
 from analysis.measures.split_control import split_control
-from analysis.measures.steepest import kink_curvature
+from analysis.measures.steepest import heaviest, kink_curvature
 from analysis.measures.units import scene_units
 from landscape.eigen.lanczos import lanczos
 from landscape.operators.operator import DenseOperator
@@ -115,6 +115,7 @@ def test_products_of_a_scene_stay_on_the_device_and_do_not_wait(monkeypatch):
         split_control(objective.active, [views[0].camera])
         depth_split(objective, torch.Generator().manual_seed(0), TraceSettings.fixed(8))
         kink_curvature(objective, V[:, 0])
+        assert heaviest(objective, [V[:, 0]], torch.Generator().manual_seed(0))[0].outline
         depth_rises(objective, torch.Generator().manual_seed(0), steps=(1.0,), draws=2)
     assert not +fake.mixed
 
