@@ -1,1 +1,0 @@
-import analysis  # noqa: F401  # which answers signals while the libraries of `python -m figures.NAME` are loaded

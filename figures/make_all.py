@@ -1,4 +1,4 @@
-"""All figures of a recorded probe or slice: `python -m figures.make_all RUN/probe` or `draw_probe(folder)`."""
+"""All figures of a recorded probe or slice: `python -m figures.make_all RUN/probe [--only surface]`."""
 
 import argparse
 from collections.abc import Collection
@@ -35,16 +35,14 @@ def recorded_figures(record: Record) -> tuple[str, ...]:
     return tuple(name for name in FIGURES if known[name])
 
 
-def draw_probe(
-    folder: str | Path, suffix: str = "png", without: Collection[str] = (), processes: int = 1
-) -> list[Path]:
-    """Draw every figure that the record in `folder` has the numbers for into it, but for some; returns the files.
+def draw_probe(folder: str | Path, suffix: str = "png", only: Collection[str] = (), processes: int = 1) -> list[Path]:
+    """Draw every figure that the record in `folder` has the numbers for into it; returns the files.
 
-    processes: that draw at a time.  Raises FileNotFoundError or ValueError for a folder that holds no readable record,
-    TooLittleMemory where the system ends one of the processes.
+    only: these alone, where any is named.  processes: that draw at a time.  Raises FileNotFoundError or ValueError for a folder
+    that holds no readable record, TooLittleMemory where the system ends one of the processes.
     """
     record = read_record(folder)
-    names = [name for name in recorded_figures(record) if name not in without]
+    names = [name for name in recorded_figures(record) if name in (only or FIGURES)]
     # what the processes are handed: no figure shows the eigenvectors, by far the largest
     used = {group: arrays for group, arrays in record.arrays.items() if group != "eigenvectors"}
     draw = partial(_draw, replace(record, arrays=used), suffix)
@@ -62,9 +60,8 @@ def _draw(record: Record, suffix: str, name: str) -> Path:
 
 
 def main() -> int:
-    """`python -m figures.make_all RUN/probe [--without surface]`"""
     options = argparse.ArgumentParser(add_help=False)
-    options.add_argument("--without", choices=FIGURES, action="append", default=[], help="a figure to leave out")
+    options.add_argument("--only", choices=FIGURES, action="append", default=[], help="a figure to draw, not all")
     draw = partial(draw_probe, processes=len(FIGURES))
     return folder_script(draw, "all figures of a recorded probe", "probe", [options])
 

@@ -8,23 +8,11 @@ import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
-from analysis.records.records import ProbeRecord, read_record
 from figures.style import PAPER, SUFFIXES, save
 from landscape.errors import InputError
-
-
-def script(draw: Callable[[Any], Figure], name: str, kind: type[ProbeRecord] | None = None) -> int:
-    """`python -m figures.NAME RUN/probe [--format pdf]`: one figure, beside its record.  kind: of record, None: any."""
-
-    def drawn(folder: Path, suffix: str) -> list[Path]:
-        record = read_record(folder, kind)
-        return [save(draw(record), record.folder / f"{name}.{suffix}")]
-
-    return folder_script(drawn, f"the figure {name} of a recorded probe", "probe")
 
 
 def folder_script(

@@ -9,7 +9,6 @@ checkpoint, so that the difference holds kinks and jumps of the loss too.  The l
 """
 
 import textwrap
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from analysis.console.failures import program
 from analysis.records.findings import resolved
 from analysis.records.quantities import exponent_of, extent, quantity, unit_suffix
 from analysis.records.records import Record
 from analysis.records.schema import FiniteProbe, Slice
 from figures.plane import Direction, direction
-from figures.scripts import script
 from figures.slice2d import CROSSED, RENDERED, finding
 from figures.style import BLACK, BLUE, VERMILION, new_figure, style
 from landscape.errors import InputError
@@ -122,7 +119,3 @@ def _limits(exact: float, values: np.ndarray, bounds: np.ndarray) -> tuple[float
     low, high = float(ends.min()), float(ends.max())
     margin = 0.2 * (high - low) or abs(exact) or 1.0
     return low - margin, high + margin
-
-
-if __name__ == "__main__":
-    program(partial(script, draw, "slice1d"))

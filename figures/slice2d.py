@@ -11,7 +11,6 @@ to know the others, the sections are drawn alone, and a sentence says what resol
 """
 
 import textwrap
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,11 +20,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, Locator, MaxNLocator
 
-from analysis.console.failures import program
 from analysis.records.quantities import AGREES, extent, quantity, rough
 from analysis.records.records import Record
 from figures.plane import Direction, Plane, plane, same_scale
-from figures.scripts import script
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, style
 
 CONTOURS = 3  # of the loss, and of the model
@@ -170,7 +167,3 @@ def _legend(field: Plane) -> list[Line2D]:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
     handles.append(Line2D([], [], linestyle="none", label=f"1 curvature unit:\nΔL = {quantity(field.loss_scale)}"))
     return handles
-
-
-if __name__ == "__main__":
-    program(partial(script, draw, "slice2d"))

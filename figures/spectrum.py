@@ -9,7 +9,6 @@ Ritz values    of the search for both ends: value against rank, on a symmetric l
 """
 
 import math
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,12 +18,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 
-from analysis.console.failures import program
 from analysis.records.quantities import measured, percent, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from analysis.records.schema import Eigenvalue
 from figures.density import at_zero, draw_on, unresolved_share
-from figures.scripts import script
 from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, style
 from landscape.errors import InputError
 
@@ -153,7 +150,3 @@ def _legend_below(axes: Axes, handles: list[Line2D]) -> None:
         handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=2, handlelength=1.2,
         borderpad=0, columnspacing=1,
     )  # fmt: skip
-
-
-if __name__ == "__main__":
-    program(partial(script, draw, "spectrum", ProbeRecord))

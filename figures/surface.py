@@ -1,7 +1,6 @@
 """Figure: the recorded slice as a surface over its two directions, with its contours on the floor.  Dots: renders."""
 
 import warnings
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, Record
 from figures.plane import NOT_CONFIRMED, plane, same_scale
-from figures.scripts import script
 from figures.slice2d import FAINT
 from figures.style import BLACK, FIELD_MAP, new_figure, style
 from landscape.errors import InputError
@@ -71,7 +68,3 @@ def _doubt(record: Record) -> str:
     """A line where the record is of a probe whose renders do not confirm the largest curvature."""
     doubted = isinstance(record.data, ProbeRecord) and record.data.eigenvalues.max.doubted
     return f"\nlargest curvature {NOT_CONFIRMED}" * doubted
-
-
-if __name__ == "__main__":
-    program(partial(script, draw, "surface"))

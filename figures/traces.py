@@ -10,7 +10,6 @@ diamond: the interval does not decide it).  An arrow at the left edge is a zero,
 """
 
 import math
-from functools import partial
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -20,12 +19,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 from msgspec import structs
 
-from analysis.console.failures import program
 from analysis.records.findings import attribute_name, largest_steps, shares_per_trace
 from analysis.records.quantities import measured, power_of_ten, rough
 from analysis.records.records import ProbeRecord, Record
 from analysis.records.schema import Trace
-from figures.scripts import script
 from figures.style import NEGATIVE, ORANGE, POSITIVE, UNDETERMINED, literal, new_figure, style
 
 SIGNS: dict[str, dict[str, Any]] = {
@@ -149,7 +146,3 @@ def _legend(entries: dict[str, Trace], by: str) -> list[Line2D]:
         return [Line2D([], [], linestyle="none", label=by, **SIGNS["positive"])] if by else []
     labels = {sign: f"{by}, {sign}".removeprefix(", ") for sign in SIGNS if sign in present}
     return [Line2D([], [], linestyle="none", label=words, **SIGNS[sign]) for sign, words in labels.items()]
-
-
-if __name__ == "__main__":
-    program(partial(script, draw, "traces", ProbeRecord))

@@ -347,12 +347,12 @@ def test_a_slice_without_a_finite_point_is_refused(tmp_path):
 
 def test_the_command_draws_the_folder_named_on_its_standard_input(tmp_path):
     folder = written(tmp_path / "probe", *synthetic()).folder
-    command = own_python("figures.make_all", "--without", "surface", "--without", "slice2d", "-")
+    command = own_python("figures.make_all", "--only", "traces", "--only", "spectrum", "-")
     for said, names in (("", []), (str(folder), ["spectrum.png", "traces.png"])):
         done = subprocess.run(**command, input=said, capture_output=True, text=True, check=True)
         assert done.stderr == "" and sorted(path.name for path in folder.glob("*.png")) == names
     by_processes = {path.name: path.read_bytes() for path in folder.glob("*.png")}
-    alone = make_all.draw_probe(folder, without=["surface", "slice2d"])  # by this process
+    alone = make_all.draw_probe(folder, only=["traces", "spectrum"])  # by this process
     assert {path.name: path.read_bytes() for path in alone} == by_processes
 
 
@@ -360,7 +360,7 @@ def test_the_end_of_a_process_that_draws_is_said(tmp_path, monkeypatch):
     folder = written(tmp_path / "probe", *synthetic()).folder
     monkeypatch.setitem(make_all.FIGURES, "traces", lambda record: os.kill(os.getpid(), signal.SIGKILL))
     with pytest.raises(TooLittleMemory, match="a process that draws was ended"):
-        make_all.draw_probe(folder, without=["surface"], processes=2)
+        make_all.draw_probe(folder, processes=2)
 
 
 def test_a_surface_marks_its_renders_and_has_true_proportions_or_says_that_it_has_not(tmp_path):
@@ -382,7 +382,9 @@ def test_a_surface_marks_its_renders_and_has_true_proportions_or_says_that_it_ha
 def test_a_figure_from_the_command_line_and_its_refusal(tmp_path):
     folder = written(tmp_path / "probe", *synthetic()).folder
     good, bad = (
-        subprocess.run([sys.executable, "-m", "figures.traces", str(place)], capture_output=True, text=True)
+        subprocess.run(
+            [sys.executable, "-m", "figures.make_all", str(place), "--only", "traces"], capture_output=True, text=True
+        )
         for place in (folder, tmp_path)
     )
     assert good.returncode == 0 and good.stdout.strip() == str(folder / "traces.png")
