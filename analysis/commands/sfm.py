@@ -4,49 +4,22 @@ import shlex
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from analysis.commands.options import SfmOptions
 from analysis.console.plain import say
-from splat.scenes.sfm.sfm import Mapped, Stage, scene_from_photos
+from analysis.console.stages import Stages
+from splat.scenes.sfm.sfm import Mapped, scene_from_photos
 
-STAGES: dict[Stage, str] = {
-    "features": "finding features",
-    "matches": "matching photographs",
-    "mapping": "placing photographs",
-    "images": "undistorting",
-}
 NAMED = 5  # photographs without a place that are named
 
 
 def run_sfm(options: SfmOptions) -> int:
     """Make the scene and say what came of it; returns the exit code."""
     out = options.out or options.photos.resolve().with_name(f"{options.photos.resolve().name}-scene")
-    progress = _progress()
-    try:
-        bars = {stage: progress.add_task(text, start=False, visible=False) for stage, text in STAGES.items()}
-
-        def show(stage: Stage, done: int, total: int) -> None:
-            if not progress.tasks[bars[stage]].started:
-                progress.start()
-                progress.start_task(bars[stage])
-            progress.update(bars[stage], completed=done, total=total, visible=True)
-
-        mapped = scene_from_photos(options.photos, out, show)
-    finally:
-        progress.stop()
+    with Stages(Console(stderr=True)) as stages:
+        mapped = scene_from_photos(options.photos, out, stages.stage)
     _report(mapped, out)
     return 0
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=Console(stderr=True),
-    )
 
 
 def _report(mapped: Mapped, out: Path) -> None:

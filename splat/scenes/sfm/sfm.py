@@ -13,25 +13,24 @@ The scene is a folder with `images` and `sparse/0`, as the tools of 3DGS expect 
 import os
 import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import pycolmap
 from PIL import ExifTags
 
 from landscape.errors import InputError
+from landscape.results import Progress
 from splat.scenes.images import IMAGE_SUFFIXES, image_files, image_header, image_pixels
 from splat.scenes.layers import opened_image
 from splat.scenes.scene import load_scene
 from splat.scenes.sfm.triangulation import SEED, matching, quiet, verification
 from splat.scenes.write import finished_folder
 
-Stage = Literal["features", "matches", "mapping", "images"]
-Progress = Callable[[Stage, int, int], None]  # stage, photographs done, photographs in all
+Stage = Callable[[str], AbstractContextManager[Progress]]  # of a name, round the stage; its progress counts photographs
 FEWEST = 3  # two to train on and one to test
-CAMERA = "SIMPLE_RADIAL"
+CAMERA, UNIT = "SIMPLE_RADIAL", "photographs"
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Mapped:
     error: float
 
 
-def scene_from_photos(photos: Path, out: Path, on_progress: Progress = lambda *_: None) -> Mapped:
+def scene_from_photos(photos: Path, out: Path, stage: Stage = lambda _: nullcontext(lambda *_: None)) -> Mapped:
     """Make the scene `out`, which must not exist yet, of the image files in a folder.
 
     ValueError where the photographs are too few or make no model; nothing is left behind then.
@@ -57,8 +56,9 @@ def scene_from_photos(photos: Path, out: Path, on_progress: Progress = lambda *_
     files = _photographs(photos)
     with finished_folder(out) as scene:
         with tempfile.TemporaryDirectory(dir=scene.parent, prefix=f".{out.name}-") as work, quiet():
-            models = _models(files, Path(work), on_progress)
-            _write_images(models[0], photos, Path(work), scene, on_progress)
+            models = _models(files, Path(work), stage)
+            with stage("undistorting"):
+                _write_images(models[0], photos, Path(work), scene)
         load_scene(scene)
     placed, *others = ({model.images[i].name for i in model.reg_image_ids()} for model in models)
     return Mapped(
@@ -89,7 +89,7 @@ def _photographs(folder: Path) -> list[Path]:
     return files
 
 
-def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[pycolmap.Reconstruction]:
+def _models(files: Sequence[Path], work: Path, stage: Stage) -> list[pycolmap.Reconstruction]:
     """The reconstructed models, the one with the most photographs first."""
     database, photos, models = work / "database.db", work / "photos", work / "models"
     photos.mkdir()
@@ -107,23 +107,24 @@ def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[py
     features = pycolmap.FeatureExtractionOptions()
     features.use_gpu = False
     together = os.cpu_count() or 1
-    for i in range(0, len(names), together):
-        on_progress("features", i, len(names))
-        pycolmap.extract_features(database, photos, names[i : i + together], extraction_options=features)
-    on_progress("features", len(names), len(names))
-    _match(database, names, work / "pairs.txt", on_progress)
+    with stage("finding features") as report:
+        for i in range(0, len(names), together):
+            pycolmap.extract_features(database, photos, names[i : i + together], extraction_options=features)
+            report(min(i + together, len(names)), len(names), UNIT)
+    with stage("matching") as report:
+        _match(database, names, work / "pairs.txt", report)
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = SEED
     placed = iter(range(3, len(names) + 1))  # a model begins with a pair; a later one begins again
-    on_progress("mapping", 0, len(names))
-    found = pycolmap.incremental_mapping(
-        database,
-        photos,
-        models,
-        options,
-        initial_image_pair_callback=lambda: on_progress("mapping", 2, len(names)),
-        next_image_callback=lambda: on_progress("mapping", next(placed, len(names)), len(names)),
-    )
+    with stage("placing") as report:
+        found = pycolmap.incremental_mapping(
+            database,
+            photos,
+            models,
+            options,
+            initial_image_pair_callback=lambda: report(2, len(names), UNIT),
+            next_image_callback=lambda: report(next(placed, len(names)), len(names), UNIT),
+        )
     if not found:
         raise InputError(_why_there_is_no_model(database, len(names)))
     for model in found.values():
@@ -144,17 +145,16 @@ def _by_camera(files: Sequence[Path]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _match(database: Path, names: Sequence[str], pairs: Path, on_progress: Progress) -> None:
+def _match(database: Path, names: Sequence[str], pairs: Path, report: Progress) -> None:
     """Match every photograph with all before it; one call each, so that progress shows and Ctrl-C is heard."""
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = pairs
-    on_progress("matches", 1, len(names))
     for i, name in enumerate(names[1:], start=1):
         pairs.write_text("".join(f"{earlier} {name}\n" for earlier in names[:i]), encoding="utf-8")
         pycolmap.match_image_pairs(
             database, matching_options=matching(), pairing_options=options, verification_options=verification()
         )
-        on_progress("matches", i + 1, len(names))
+        report(i + 1, len(names), UNIT)
 
 
 def _why_there_is_no_model(path: Path, photos: int) -> str:
@@ -168,14 +168,11 @@ def _why_there_is_no_model(path: Path, photos: int) -> str:
     )
 
 
-def _write_images(model: pycolmap.Reconstruction, photos: Path, work: Path, scene: Path, on_progress: Progress) -> None:
+def _write_images(model: pycolmap.Reconstruction, photos: Path, work: Path, scene: Path) -> None:
     """Pinhole images and their model."""
-    total = model.num_reg_images()
-    on_progress("images", 0, total)
     (work / "kept").mkdir()
     model.write_binary(work / "kept")
     pycolmap.undistort_images(work / "undistorted", work / "kept", photos)
     (scene / "sparse").mkdir(parents=True)
     (work / "undistorted/sparse").rename(scene / "sparse/0")
     (work / "undistorted/images").rename(scene / "images")
-    on_progress("images", total, total)

@@ -24,10 +24,10 @@ def said(capsys) -> str:
 def test_the_scene_lies_beside_the_photographs_and_says_what_was_left_out(photos, capsys, monkeypatch):
     asked = []
 
-    def make(folder, out, show):
+    def make(folder, out, stage):
         asked.append((folder, out))
-        for done in range(4):
-            show("features", done, 3)
+        with stage("finding features") as report:
+            report(3, 3, "photographs")
         return Mapped(5, tuple(f"{i}.png" for i in range(7)), (5, 4), 120, 0.456)
 
     monkeypatch.setattr("analysis.commands.sfm.scene_from_photos", make)

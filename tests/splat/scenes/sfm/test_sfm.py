@@ -1,13 +1,17 @@
 """Scenes from photographs, of a place whose cameras are known."""
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
 from PIL import ExifTags, Image
 
+from landscape.results import Progress
 from splat.scenes.scene import load_scene
 from splat.scenes.sfm.sfm import Mapped, _by_camera, _models, scene_from_photos
 from tests.refusals import refused
@@ -31,12 +35,18 @@ def write_blank(folder: Path, names: list[str]) -> None:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> tuple[Path, Mapped, list[tuple[str, int, int]]]:
+def made(tmp_path_factory) -> tuple[Path, Mapped, list[tuple[str, Any, int]]]:
     """A scene of five photographs and one that shows nothing, and the progress that was said."""
     root, progress = tmp_path_factory.mktemp("sfm"), []
     write_photos(root / "photos", ["a b.png", "c.png", "d.png", "e.png", "f.png"])
     write_blank(root / "photos", ["wall.png"])
-    mapped = scene_from_photos(root / "photos", root / "out" / "scene", lambda *said: progress.append(said))
+
+    @contextmanager
+    def stage(name: str) -> Iterator[Progress]:
+        yield lambda done, most, _: progress.append((name, done, most))
+        progress.append((name, "ended", 0))
+
+    mapped = scene_from_photos(root / "photos", root / "out" / "scene", stage)
     return root / "out" / "scene", mapped, progress
 
 
@@ -66,9 +76,9 @@ def test_what_became_of_the_photographs_is_told(made) -> None:
     assert points is not None and mapped.points == len(points) > 100
     assert (mapped.placed, mapped.left_out, mapped.models) == (5, ("wall.png",), (5,))
     assert 0 < mapped.error < 1
-    for stage, last in (("features", 6), ("matches", 6), ("mapping", 5), ("images", 5)):
-        counts = [done for said, done, _ in progress if said == stage]
-        assert counts == sorted(counts) and counts[-1] == last and len(counts) > 1
+    for stage, last in (("finding features", 6), ("matching", 6), ("placing", 5), ("undistorting", None)):
+        *counts, ended = [done for said, done, _ in progress if said == stage]
+        assert counts == sorted(counts) and counts[-1:] == [last] * bool(last) and ended == "ended"
     assert sorted(path.name for path in scene.iterdir()) == ["images", "sparse"]
     assert [path.name for path in scene.parent.iterdir()] == ["scene"]  # the folder that it grew in is gone
 
@@ -104,12 +114,15 @@ def test_photographs_that_make_no_model_leave_nothing_behind(tmp_path: Path) -> 
 def test_stopping_leaves_nothing_behind(tmp_path: Path) -> None:
     write_photos(tmp_path / "photos", ["a.png", "b.png", "c.png", "d.png"])
 
-    def stop(stage: str, done: int, total: int) -> None:
-        if stage == "mapping" and done == 3:
+    def stop(done: int, *_: object) -> None:
+        if done == 3:
             raise KeyboardInterrupt
 
+    quiet = {"placing": stop}
     with pytest.raises(KeyboardInterrupt):
-        scene_from_photos(tmp_path / "photos", tmp_path / "scene", stop)
+        scene_from_photos(
+            tmp_path / "photos", tmp_path / "scene", lambda name: nullcontext(quiet.get(name, lambda *_: None))
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
