@@ -44,6 +44,7 @@ from splat.render.backend import backend_of
 from splat.render.render import render
 from splat.render.sight import Sight
 from splat.scenes.view import View
+from splat.scenes.write import bytes_of
 
 NEAR = 0.01  # |residual|, of a range of 1, below which residuals are taken to be spread evenly
 LEAST, MOST = 0.05, 5  # smallest share of the mass of a carrier; most carriers
@@ -298,13 +299,8 @@ def _pictures(
         name="difference", words=words, unit="of the range of a colour", scale="linear", low=-reach, high=reach
     )
     parts |= {"view": view.image, "photograph": view.image[:, top:bottom, left:right]}
-    pictures = {name: in_bytes(part).transpose(1, 2, 0) for name, part in parts.items()}
+    pictures = {name: bytes_of(part) for name, part in parts.items()}
     return pictures | {"difference": shade.bytes(change)}, shade
-
-
-def in_bytes(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "3 h w"]:
-    """An image clamped to [0, 1], as bytes."""
-    return (image.detach().clamp(0, 1) * 255).round().byte().numpy()
 
 
 def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, count: int) -> str:

@@ -4,13 +4,12 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from PIL import Image
-from torch import Tensor
 
 from analysis.records.records import PHOTOGRAPH, RENDER
 from splat.curvature.objective import SceneObjective
 from splat.render.render import render
+from splat.scenes.write import bytes_of
 
 MOST = 12  # views, spread evenly over all of them
 WIDEST, QUALITY = 800, 88  # pixels; of JPEG
@@ -24,11 +23,6 @@ def write_views(folder: Path, objective: SceneObjective, named: Collection[str] 
         view = objective.views[index]
         image = render(objective.active, view.camera, objective.background, objective.settings).image
         for name, picture in ((PHOTOGRAPH, view.image), (RENDER, image)):
-            _write(picture, folder / name.format(index))
-
-
-def _write(picture: Float[Tensor, "3 h w"], path: Path) -> None:
-    pixels = (picture.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
-    image = Image.fromarray(pixels)
-    image.thumbnail((WIDEST, WIDEST))
-    image.save(path, quality=QUALITY)
+            reduced = Image.fromarray(bytes_of(picture))
+            reduced.thumbnail((WIDEST, WIDEST))
+            reduced.save(folder / name.format(index), quality=QUALITY)

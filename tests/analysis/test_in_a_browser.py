@@ -118,8 +118,7 @@ def test_a_click_a_field_and_a_step_reach_the_viewer(browser, viewer):
     (direction, reach), active = viewer.steps["e₁"], viewer.objective.active
     there = active.with_flat(active.flat + reach * direction)
     until(browser, f"document.body.innerText.includes('loss {view.quantity(viewer.objective.loss(there.flat))}')")
-    image = view.in_bytes(rendered(viewer.objective, 1, there))
-    assert (viewer.render.image == image.transpose(1, 2, 0)).all()
+    assert (viewer.render.image == view.bytes_of(rendered(viewer.objective, 1, there))).all()
 
 
 def test_the_page_of_the_splats_needs_no_network_and_switches_colours(browser, viewer, tmp_path):

@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
-from analysis.measures.steepest import in_bytes
 from analysis.records.quantities import Shade, share_in_bytes
 from splat.curvature.objective import SceneObjective
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.render.render import render, render_layers
+from splat.scenes.write import bytes_of
 
 LEAST = 0.02  # weight of a pixel's splats with a value, below which it has none
 WORST = 0.99  # of the errors: the end of their scale
@@ -45,7 +45,7 @@ def view_maps(
     view, image = objective.views[index], rendered(objective, index)
     difference = image - view.image.to(image)
     squared = float(difference.double().square().mean())
-    found = {name: in_bytes(part).transpose(1, 2, 0) for name, part in (("photograph", view.image), ("render", image))}
+    found = {name: bytes_of(part) for name, part in (("photograph", view.image), ("render", image))}
     found["error"] = error_scale.bytes(difference.abs().mean(dim=0).numpy())
     fields = composited(objective, view.camera, torch.stack([*shares.values()], dim=1))
     found |= {name: share_in_bytes(field) for name, field in zip(shares, fields, strict=True)}

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from analysis.commands.map.fields import Fields, in_words
 from analysis.commands.map.pictures import rendered
-from analysis.measures.steepest import in_bytes
 from analysis.measures.units import UNITS
 from analysis.records.quantities import Shade, percent, quantity
 from landscape.errors import InputError
@@ -33,6 +32,7 @@ from splat.model.harmonics import Y00
 from splat.projection.antialias import baked
 from splat.projection.reference import rotation_matrices
 from splat.render.sight import sight
+from splat.scenes.write import bytes_of
 
 APPEARANCE = "appearance"
 RADIUS, WITHIN = 20.0, 0.95  # viser's units, and the share of the Gaussians that lies within
@@ -129,7 +129,7 @@ class Viewer:
             scene.add_camera_frustum(
                 f"/cameras/{view.name}", fov=2 * float(np.arctan(camera.height / 2 / camera.fy)),
                 aspect=camera.width / camera.height, scale=apart / 10,
-                image=in_bytes(view.image).transpose(1, 2, 0)[::step, ::step],
+                image=bytes_of(view.image)[::step, ::step],
                 wxyz=turn, position=place, thickness=1.0, thickness_units="screen", visible=camera is not cameras[start],
             )  # fmt: skip
         own, first = cameras[start], self.server.initial_camera
@@ -201,7 +201,7 @@ class Viewer:
         return self.objective.active.with_flat(flat)
 
     def _image(self, gaussians: Gaussians) -> np.ndarray:
-        return in_bytes(rendered(self.objective, self._place(), gaussians)).transpose(1, 2, 0)
+        return bytes_of(rendered(self.objective, self._place(), gaussians))
 
     def _place(self) -> int:
         return [view.name for view in self.objective.views].index(self.view.value)

@@ -97,7 +97,7 @@ def test_the_controls_colour_hide_and_step(viewer, objective):
     viewer.sliders["e₁"].value = view.UNITS  # all the way
     viewer.step()
     there = objective.active.with_flat(objective.active.flat + 0.05 * direction)
-    expected_image = view.in_bytes(rendered(objective, 0, there)).transpose(1, 2, 0)
+    expected_image = view.bytes_of(rendered(objective, 0, there))
     assert np.array_equal(viewer.render.image, expected_image)
     assert f"{view.quantity(objective.loss(there.flat))}" in viewer.loss.content
     viewer.click(*_ray(viewer, objective))
@@ -116,7 +116,7 @@ def test_the_page_opens_in_the_training_view_that_it_is_told(objective, start):
         assert np.allclose(ahead / np.linalg.norm(ahead), camera.forward, atol=1e-6)
         assert first.fov == pytest.approx(2 * np.arctan(camera.height / 2 / camera.fy))
         assert found.view.value == objective.views[start].name
-        assert np.array_equal(found.render.image, view.in_bytes(rendered(objective, start)).transpose(1, 2, 0))
+        assert np.array_equal(found.render.image, view.bytes_of(rendered(objective, start)))
     finally:
         server.stop()
 
