@@ -28,15 +28,15 @@ from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.run_files import COMPARISON, read_comparison
 from analysis.records.schema import Trace
 from figures.density import at_zero, unresolved_share
-from figures.plane import Plane, plane
+from figures.manifold import Scale, contours
+from figures.plane import plane
 from figures.scripts import folder_script
 from figures.slice2d import RENDERED
-from figures.style import BLACK, COLUMN, FIELD_MAP, MISSING, RUNS, VERMILION, literal, new_figure, save, style
+from figures.style import BLACK, COLUMN, RUNS, VERMILION, literal, new_figure, save, style
 from landscape.errors import InputError
 
 Records = Mapping[str, Record[ProbeRecord]]
 LINES = ("-", "--", ":")  # once the colours are used up
-LEVELS = 12
 ACROSS = 3  # panels in a row
 WIDTH = 5.0  # inches for the panels of a row
 END: dict[str, Any] = {"linestyle": (0, (2, 2)), "linewidth": 0.6}
@@ -137,11 +137,7 @@ def beyond(nodes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def draw_slices(records: Records) -> Figure:
     """The planes in the window that all of them have."""
     planes = {label: plane(record) for label, record in records.items() if _has_surface(record)}
-    reach = min(float(np.abs(axis.steps).max()) for field in planes.values() for axis in (field.x, field.y))
-    shown = np.concatenate([_within(field, reach) for field in planes.values()])
-    steps, loss = exponent_of(reach), exponent_of(shown)
-    levels = MaxNLocator(LEVELS).tick_values(shown.min() / 10.0**loss, shown.max() / 10.0**loss)
-    window = np.array([-1, 1]) * reach / 10.0**steps
+    scale = Scale.of(*planes.values())
     rows, columns = -(-len(planes) // ACROSS), min(len(planes), ACROSS)
     with style():
         figure = new_figure(0.4 + (0.3 + min(WIDTH / columns, TALLEST)) * rows, 2 * COLUMN)
@@ -149,26 +145,14 @@ def draw_slices(records: Records) -> Figure:
         for axes in panels.ravel()[len(planes) :]:
             axes.set_axis_off()
         for axes, (label, field) in zip(panels.ravel(), planes.items(), strict=False):
-            x, y, change = field.x.steps / 10.0**steps, field.y.steps / 10.0**steps, field.rise.T / 10.0**loss
-            change = np.ma.clip(change, levels[0], levels[-1])  # which it leaves outside the window only
-            axes.set_facecolor(MISSING)
-            filled = axes.contourf(x, y, change, levels=levels, cmap=FIELD_MAP)
-            axes.contour(x, y, change, levels=levels[1:-1], colors=BLACK, linewidths=0.4, linestyles="solid")
+            filled = contours(axes, field, scale)
             i, j = np.nonzero(field.dots)
-            axes.plot(x[i], y[j], **RENDERED)
+            axes.plot(field.x.steps[i] / 10.0**scale.steps, field.y.steps[j] / 10.0**scale.steps, **RENDERED)
             axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
             axes.set_title(literal(label), loc="left")
-            axes.set(xlim=window, ylim=window, aspect="equal")
-        figure.supxlabel(f"step along the steepest, units of the parameters{unit_suffix(steps)}", fontsize=7)
-        figure.supylabel(f"step along the second{unit_suffix(steps)}", fontsize=7)
-        figure.colorbar(filled, ax=panels, label=f"change of loss{unit_suffix(loss)}", ticks=levels[1:-1:2])  # pyright: ignore[reportPossiblyUnboundVariable]
+            axes.label_outer()
+        figure.colorbar(filled, ax=panels, label=scale.loss_label, ticks=filled.levels[1:-1:2])  # pyright: ignore
     return figure
-
-
-def _within(field: Plane, reach: float) -> np.ndarray:
-    """The changes of the loss at the points of the window that are finite."""
-    inside = np.outer(np.abs(field.x.steps) <= reach * (1 + 1e-9), np.abs(field.y.steps) <= reach * (1 + 1e-9))
-    return field.rise[inside].compressed()
 
 
 def _has_surface(record: Record[ProbeRecord]) -> bool:

@@ -205,7 +205,8 @@ def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
     """Landscape from above, at levels that all landscapes share."""
     steps, loss = 10.0**scale.steps, 10.0**scale.loss
     levels = np.asarray(MaxNLocator(LEVELS).tick_values(scale.low / loss, scale.high / loss))
-    x, y, change = landscape.x.steps / steps, landscape.y.steps / steps, landscape.rise.T / loss
+    x, y = landscape.x.steps / steps, landscape.y.steps / steps
+    change = np.ma.clip(landscape.rise.T / loss, levels[0], levels[-1])  # which it leaves outside the limits only
     axes.set_facecolor(MISSING)
     filled = axes.contourf(x, y, change, levels=levels, cmap=FIELD_MAP)
     axes.contour(x, y, change, levels=levels, colors=BLACK, linewidths=0.4, linestyles="solid")
