@@ -31,12 +31,13 @@ from analysis.probe.plan import compiles, expected_seconds, seconds_of_render
 from analysis.probe.record import probe_arrays, probe_record
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.views import write_views
+from analysis.records.page.report import FILE as REPORT
+from analysis.records.page.report import write_report
 from analysis.records.page.summary import guess, remarks, steps_made, summary
 from analysis.records.provenance import provenance_of, require_seed
-from analysis.records.records import Arrays, ProbeRecord, record_folder, require_replaceable
+from analysis.records.records import ProbeRecord, record_folder, require_replaceable
 from analysis.records.run_files import CHECKPOINT
 from analysis.records.tables import family_table, probe_table
-from landscape import EigenEnds
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import spawn
@@ -104,10 +105,18 @@ def _run(
         arrays = probe_arrays(found.traces, found.ends, found.density, found.plane)
         data.steps = step_lengths(*rates)
         if families is not None:
-            data = _with_families(data, arrays, families, objective, checkpoint, generator, stages, found.ends)
+            from analysis.measures.per_attribute import measure_per_attribute  # slow to import
+
+            stream = spawn(generator)
+            measured = measure_per_attribute(objective, checkpoint.training, families, stream, stages.stage, found.ends)
+            data, arrays["per_attribute"] = measured.added_to(data), measured.arrays()
         data.notes += checkpoint.assumptions
         if folder is not None:
-            _write(folder, data, arrays, objective, stages, start, drawn)
+            objective.release()  # for the memory of the processes that draw
+            ends = data.eigenvalues.max, data.eigenvalues.min
+            write_views(folder, objective, [end.carrier.view for end in ends if end.carrier])
+            write_with_pictures(folder, data, arrays, stages, start, drawn)
+            write_report(folder)
     if writes:
         if not found.unreached:
             shutil.rmtree(unfinished, ignore_errors=True)
@@ -145,45 +154,6 @@ def asked(options: ProbeOptions, checkpoint: Checkpoint) -> Fingerprint:
     families = _family_options(options)
     settings = asdict(probe_settings(options)) | ({} if families is None else {"per_attribute": asdict(families)})
     return checkpoint.fingerprint(settings, options.seed, LossSettings() if options.loss == "3dgs" else None)
-
-
-def _with_families(
-    data: ProbeRecord,
-    arrays: Arrays,
-    options: "PerAttributeOptions",
-    objective: SceneObjective,
-    checkpoint: Checkpoint,
-    generator: torch.Generator,
-    stages: Stages,
-    ends: EigenEnds,
-) -> ProbeRecord:
-    """Measure the families; returns the record with them, and adds theirs to the arrays."""
-    from analysis.measures.per_attribute import measure_per_attribute
-
-    training, stream = checkpoint.training, spawn(generator)
-    families = measure_per_attribute(objective, training, options, stream, stages.stage, ends)
-    arrays["per_attribute"] = families.arrays()
-    return families.added_to(data)
-
-
-def _write(
-    folder: Path,
-    data: ProbeRecord,
-    arrays: Arrays,
-    objective: SceneObjective,
-    stages: Stages,
-    start: float,
-    drawn: Draw | None,
-) -> None:
-    """Write the record, its pictures and its page into the folder."""
-    objective.release()  # for the memory of the processes that draw
-    write_views(
-        folder, objective, [end.carrier.view for end in (data.eigenvalues.max, data.eigenvalues.min) if end.carrier]
-    )
-    write_with_pictures(folder, data, arrays, stages, start, drawn)
-    from analysis.records.page.report import write_report
-
-    write_report(folder)
 
 
 def probe_settings(options: ProbeOptions) -> ProbeSettings:
@@ -228,8 +198,6 @@ def _expected(objective: SceneObjective, settings: ProbeSettings, further: float
 
 def conclude(data: ProbeRecord, out: Path, verbose: bool, guessed: Sequence[str]) -> None:
     """Print the summary (verbose: and the tables), what failed and what is not known, with remedies."""
-    from analysis.records.page.report import FILE as REPORT
-
     console = Console()
     if verbose:
         console.print(probe_table(data, console.width))
