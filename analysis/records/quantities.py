@@ -128,13 +128,13 @@ def ratio(aspect: float) -> str:
     return f"{rough(aspect)} : 1"
 
 
-def limits(low: float | None, high: float | None, between: str = " … ") -> str:
+def limits(low: float | None, high: float | None) -> str:
     """Both ends of an interval; one number where both look alike.
 
-    >>> limits(0.17504, 0.17531), limits(None, 2.0), limits(1.0, 3.0, " to ")
-    ('0.175', '– … 2.00', '1.00 to 3.00')
+    >>> limits(0.17504, 0.17531), limits(None, 2.0)
+    ('0.175', '– … 2.00')
     """
-    return between.join(dict.fromkeys((quantity(low), quantity(high))))
+    return " … ".join(dict.fromkeys((quantity(low), quantity(high))))
 
 
 def power_of_ten(exponent: int) -> str:

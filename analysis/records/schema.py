@@ -93,12 +93,6 @@ class TraceOf(Struct, kw_only=True):
         low, high = self.interval[0] - apart, self.interval[1] + apart
         return 0.0 if low <= 0 <= high else min(abs(low), abs(high)), max(abs(low), abs(high))
 
-    def exceeds(self, other: "TraceOf") -> bool:
-        """Whether |value| is larger than the other's by two standard errors of the difference; not where one is not known."""
-        given = [error for each in (self, other) for error in (each.standard_error, each.views_error)]
-        errors = [math.inf if error is None else error for error in given if error is not UNSET]
-        return abs(self.value or 0.0) - abs(other.value or 0.0) > 2 * math.hypot(*errors)
-
 
 class Trace(TraceOf, kw_only=True):
     """Trace of one attribute's block.  dim: its directions that are not exactly flat; tau: sqrt(max(value, 0) / dim)."""
