@@ -14,6 +14,7 @@ import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -24,6 +25,7 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
+from analysis.console.kept import Kept
 from analysis.console.plain import say
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
@@ -33,14 +35,20 @@ from analysis.probe.measurement import evaluation
 from analysis.records.findings import of_slice, resolved
 from analysis.records.provenance import provenance_of, require_seed
 from analysis.records.quantities import apart, measured, quantity
-from analysis.records.records import SliceRecord, record_folder, recorded_probe, require_replaceable
+from analysis.records.records import (
+    ProbeRecord,
+    Record,
+    SliceRecord,
+    record_folder,
+    recorded_probe,
+    require_replaceable,
+)
 from analysis.records.schema import FiniteProbe
 from analysis.slice.directions import Direction, Shape, axis_of, find_directions
 from analysis.slice.options import SliceOptions
 from analysis.slice.record import Found, slice_arrays, slice_record
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
 from landscape.errors import InputError
-from landscape.probes import spawn
 from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
 from splat.backend.device import device_named
 from splat.backend.memory import staying_within
@@ -49,9 +57,10 @@ from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
 from splat.model.untrusted import KeptArrays
 from splat.training.checkpoint import load_checkpoint, open_subject
-from splat.training.origin.fingerprint import Fingerprint, state_of
+from splat.training.origin.fingerprint import state_of
 from splat.training.origin.subject import Checkpoint
 
+STREAMS = ("eigenvectors", "random", "holdout", "directions")  # of random numbers; "directions" draws none itself
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
 
@@ -82,10 +91,11 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
     # the folder is opened first, so that one that cannot be written is refused before anything is rendered
     with record_folder(out, SliceRecord.FILE) as folder, stages:
         notes: list[str] = []
-        kept = unfinished / made.but("settings", "seed").digest  # the points have a digest of their own
-        known = _known(options.checkpoint.parent / "probe", kept, made, objective.active.flat.device, notes)
+        seed, recorded = torch.Generator(device).manual_seed(options.seed), options.checkpoint.parent / "probe"
+        kept = Kept(stages, seed, STREAMS, folder=unfinished, identity=f"{made.digest} {device}")
+        known = recorded_probe(recorded, made, notes)
         try:
-            found = _measure(objective, shape, others, known, settings, options, kept, stages, checkpoint.all_views)
+            found = _measure(objective, shape, others, known, settings, options, kept, checkpoint.all_views)
         except BaseException:
             if unfinished.is_dir():
                 say(f"what was rendered is kept; to continue: {shlex.join(command)}", console=console)
@@ -131,34 +141,19 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     return there.aligned_to(here).flat
 
 
-def _known(probe: Path, unfinished: Path, made: Fingerprint, device: torch.device, notes: list[str]) -> list[Tensor]:
-    """Eigenvectors of an interrupted run and of the probe.  notes: gets a sentence on those that cannot be read."""
-    found = []
-    try:
-        found += [torch.from_numpy(each).to(device) for each in _kept(unfinished).read().values()]
-    except InputError as error:
-        notes.append(f"{error}; they were computed again")
-    if recorded := recorded_probe(probe, made, notes):
-        vectors = torch.from_numpy(recorded.arrays["eigenvectors"]["largest"])
-        found.append(vectors.to(device))
-    return found
-
-
 def _measure(
     objective: SceneObjective,
     shape: Shape,
     others: list[Float[Tensor, " n"]],
-    known: list[Tensor],
+    probe: Record[ProbeRecord] | None,
     settings: SliceSettings,
     options: SliceOptions,
-    unfinished: Path,
-    stages: Stages,
+    kept: Kept,
     population: int | None,
 ) -> Found:
-    """Run the stages after `load`.  population: number of training views, where the objective has fewer."""
-    center = objective.active.flat
-    seed = torch.Generator(center.device).manual_seed(options.seed)
-    generators = {name: spawn(seed) for name in ("eigenvectors", "random", "holdout")}
+    """Run the stages after `load`.  probe: of this checkpoint; population: the training's views, where the objective has fewer."""
+    center, stages = objective.active.flat, kept.stages
+    known = [torch.from_numpy(probe.arrays["eigenvectors"]["largest"]).to(center.device)] if probe else []
     with stages.stage("linearise") as report:
         report(0, 1, f"{len(objective.views)} views")
         gradient = objective.gradient
@@ -166,11 +161,11 @@ def _measure(
     operator = CountingOperator(SceneHessian(objective))
     hessian = SceneHessian(objective, keep_null=True)  # a line may have components in the null space
     true = CountingOperator(hessian)
-    with stages.stage("directions") as report:
-        directions = find_directions(shape, objective, operator, others, known, generators, report)
-        _keep_eigenvectors(directions, unfinished)
-        vectors = torch.stack([direction.vector for direction in directions], dim=1)
-        curvatures = (vectors.double() * true.apply(vectors).double()).sum(dim=0).tolist()
+    find = partial(find_directions, shape, objective, operator, others, known, kept.streams)
+    directions = kept.run("directions", list[Direction], lambda _, report, __: find(report))
+    assert directions is not None  # there is no deadline
+    vectors = torch.stack([direction.vector for direction in directions], dim=1)
+    curvatures = (vectors.double() * true.apply(vectors).double()).sum(dim=0).tolist()
     loss_scale = RISE * objective.loss(center)
     axes = [
         axis_of(direction.kind, radius, options.points, curvature, loss_scale)
@@ -178,32 +173,21 @@ def _measure(
     ]
     loss = _evaluation(objective, settings.workers)
     digest = slice_digest(center, vectors, torch.cat(axes))
-    store = KeptArrays(unfinished / f"{digest[:16]}.npz")
+    assert kept.folder is not None
+    store = KeptArrays(kept.folder / f"{digest[:16]}.npz")
     with stages.stage("slice") as report:
         found = evaluate_slice(
-            loss, center, vectors, axes, gradient, true, settings, generators["holdout"], store, report
+            loss, center, vectors, axes, gradient, true, settings, kept.streams["holdout"], store, report
         )
-    probe = None
+    finite = None
     if shape.dimension == 1:
         reach = 1.0 if shape.kind == "line" else float(axes[0][-1])
         with stages.stage("finite steps") as report:
             steps = [reach * step for step in DECADES]
-            probe = finite_probe(_evaluation(objective, 1), center, vectors[:, 0], true, steps, report)
+            finite = finite_probe(_evaluation(objective, 1), center, vectors[:, 0], true, steps, report)
     by_view = None if population is None else hessian.by_view(vectors)
     matvecs = operator.matvecs + true.matvecs
-    return Found(found, probe, directions, vectors, loss_scale, matvecs, population, by_view)
-
-
-def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:
-    """Write the eigenvectors for a run that continues this one."""
-    vectors = [direction.vector.cpu().numpy() for direction in directions if direction.kind == "eigenvectors"]
-    if not vectors:
-        return
-    _kept(unfinished).write(vectors=np.stack(vectors, axis=1))
-
-
-def _kept(unfinished: Path) -> KeptArrays:
-    return KeptArrays(unfinished / "eigenvectors.npz")
+    return Found(found, finite, directions, vectors, loss_scale, matvecs, population, by_view)
 
 
 def _evaluation(objective: SceneObjective, workers: int) -> Loss:
