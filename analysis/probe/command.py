@@ -37,7 +37,7 @@ from analysis.records.page.summary import guess, remarks, steps_made, summary
 from analysis.records.provenance import provenance_of, require_seed
 from analysis.records.records import ProbeRecord, record_folder, require_replaceable
 from analysis.records.run_files import CHECKPOINT
-from analysis.records.tables import family_table, probe_table
+from analysis.records.tables import family_table
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import spawn
@@ -120,7 +120,7 @@ def _run(
     if writes:
         if not found.unreached:
             shutil.rmtree(unfinished, ignore_errors=True)
-        conclude(data, out, options.verbose, guessed)
+        conclude(data, out, guessed)
         of = options.checkpoint.parent if options.checkpoint.name == CHECKPOINT else options.checkpoint
         more = " and the same options on its tool and scene" if checkpoint.origin else ""
         say(f"next: open the report in a browser; landscape map {shlex.quote(str(of))}{more}")
@@ -196,15 +196,11 @@ def _expected(objective: SceneObjective, settings: ProbeSettings, further: float
     return f"about {seconds:,.0f} s, roughly{more}, and {peak / 1e9:.1f} GB of memory"
 
 
-def conclude(data: ProbeRecord, out: Path, verbose: bool, guessed: Sequence[str]) -> None:
-    """Print the summary (verbose: and the tables), what failed and what is not known, with remedies."""
+def conclude(data: ProbeRecord, out: Path, guessed: Sequence[str]) -> None:
+    """Print the summary, what failed and what is not known, with remedies."""
     console = Console()
-    if verbose:
-        console.print(probe_table(data, console.width))
-        pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-        say(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", console=console)
     if data.per_attribute:
         console.print(family_table(data))
-    for line in remarks(data, verbose):
+    for line in remarks(data):
         console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False, markup=False)
     say(*summary(data, out / REPORT), *guessed, console=console)

@@ -25,8 +25,6 @@ class ProbeOptions:
     3dgs: that of 3DGS, to compare trainings with other losses."""
     strict: bool = False
     """Exit with 1 if a self-check fails."""
-    verbose: bool = False
-    """Print every number, not only a summary."""
     quick: bool = False
     """Numbers to 10%, in a quarter of the time, into probe-quick; without density, indices that need it, power iteration,
     finite probe, depth, and the slice's plane."""

@@ -1,7 +1,6 @@
-"""Tables of a probe's record: all numbers, for the terminal; the anisotropy families, for the terminal and the report."""
+"""Tables of a probe's record: all numbers, for the report; the anisotropy families, for the terminal and the report."""
 
 import math
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -35,10 +34,8 @@ ENDS = {
 }
 NEEDS_DENSITY = "needs the spectral density, which was left out"  # note of an index
 OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
-ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not always the extreme one."
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
 LEAST = 0.005  # share of an attribute in an eigenvector that is told
-GAPS, NUMBER, REMARK = 8, 27, 22  # of the probe's table: between columns, widest number in a line, least room for words
 WIDTH = 15  # of a column of the families' table, with which it fits into 80
 NARROW = 0.1  # width of a bracket, over the value, below which it is written as an error
 Row = tuple[str, str, str]
@@ -57,36 +54,6 @@ def number_rows(data: ProbeRecord) -> dict[str, list[Row]]:
         "Checks": _check_rows(data.checks),
     }
     return {name: known for name, rows in sections.items() if (known := list(rows))}
-
-
-def probe_table(data: ProbeRecord, width: int = 80) -> Table:
-    """All numbers.  Words are wrapped to the width, numbers are not."""
-    sections = [[(r[0], _folded(r[1], NUMBER), r[2]) for r in rows] for rows in number_rows(data).values()]
-    cells = [row for rows in sections for row in rows]
-    name, value = (max(len(line) for row in cells for line in row[i].splitlines()) for i in (0, 1))
-    name = min(name, max(width - value - GAPS - REMARK, REMARK))
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=ERRORS, caption_justify="left")
-    table.add_column("", no_wrap=True)
-    table.add_column("value ± error", justify="right", no_wrap=True)
-    table.add_column("", no_wrap=True)
-    for rows in sections:
-        for row in rows:
-            shown = wrapped(row[0], name), row[1], wrapped(row[2], width - name - value - GAPS)
-            table.add_row(*map(escape, shown))
-        table.add_section()
-    return table
-
-
-def wrapped(text: str, width: int) -> str:
-    """Text in lines of at most this width; a number is not broken from its error or its unit px.
-
-    >>> print(wrapped(f"{quantity(8.6e-6, 6e-7)} over {quantity(1.37e-4, 1e-5)}", 22).replace(HARD, " "))
-    (8.60 ± 0.60) × 10⁻⁶
-    over
-    (1.37 ± 0.10) × 10⁻⁴
-    """
-    text = text.replace(" px", f"{HARD}px")
-    return textwrap.fill(text, max(width, 12), break_long_words=False, break_on_hyphens=False)
 
 
 def _trace_rows(data: ProbeRecord) -> Iterator[Row]:
@@ -259,13 +226,13 @@ def family_table(data: ProbeRecord) -> Table:
     return table
 
 
-def _folded(text: str, width: int = WIDTH) -> str:
+def _folded(text: str) -> str:
     """Text, broken in two at ± or … where it is wider than a column.
 
     >>> _folded("7.45 × 10⁻⁴ … 1.02 × 10⁴"), _folded("34.1 … 120")
     ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
     """
-    return text if len(text) <= width else text.replace(PLUS_MINUS, f"\n±{HARD}").replace(" … ", " …\n")
+    return text if len(text) <= WIDTH else text.replace(PLUS_MINUS, f"\n±{HARD}").replace(" … ", " …\n")
 
 
 def bracketed(index: Index | None) -> Cell:

@@ -151,7 +151,7 @@ def _measure(
     kept: Kept,
     population: int | None,
 ) -> Found:
-    """Run the stages after `load`.  probe: of this checkpoint; population: the training's views, where the objective has fewer."""
+    """Run the stages after `load`.  probe: of this checkpoint; population: training views, where the objective has fewer."""
     center, stages = objective.active.flat, kept.stages
     known = [torch.from_numpy(probe.arrays["eigenvectors"]["largest"]).to(center.device)] if probe else []
     with stages.stage("linearise") as report:

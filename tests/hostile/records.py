@@ -65,7 +65,7 @@ def _write_probes(root: Path) -> None:
 
 def _use_probes(root: Path, chance: Random) -> Read:
     from analysis.records.findings import findings
-    from analysis.records.tables import family_table, probe_table
+    from analysis.records.tables import family_table, number_rows
     from analysis.runs.compare import cautions, render_page
     from analysis.runs.compare_table import Run, compare_table, comparison, frame
     from analysis.runs.seeds import groups_of
@@ -74,7 +74,7 @@ def _use_probes(root: Path, chance: Random) -> Read:
     checkpoint = Checkpoint(Training.start(tiny_gaussians(), EXTENT, tiny_config()), REFERENCE)
     with io.StringIO() as quiet:
         console = Console(file=quiet, width=100)
-        console.print(probe_table(record.data))
+        number_rows(record.data)
         console.print(family_table(record.data))
         findings(record.data)
         runs = [Run(root, name, checkpoint, None, each.data) for name, each in (("a", record), ("b", other))]

@@ -41,7 +41,7 @@ from landscape.slices.slices import curvature_reach
 from landscape.traces.pixels import gauss_newton_blocks
 
 NAMED = re.compile(r"(.+\.py):([^\W\d]\w*)")
-USED = {"checkpoint", "out", "seed", "strict", "verbose", "quick", "density_products", "end_products", "slice_points"}
+USED = {"checkpoint", "out", "seed", "strict", "quick", "density_products", "end_products", "slice_points"}
 POSITIONS, HALVINGS = "means", 7  # of the step along an end that changes the loss by RISE
 
 
@@ -67,7 +67,7 @@ def run_any_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Dra
         )
         write_with_pictures(folder, data, arrays, stages, start, drawn)
         write_report(folder)
-    conclude(data, out, options.verbose, [])
+    conclude(data, out, [])
     return CHECK_FAILED if options.strict and not all(check.passed for check in data.checks.values()) else 0
 
 

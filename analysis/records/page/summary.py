@@ -86,10 +86,9 @@ def _views(counts: Counts) -> str:
     return f"{counts.views} of {counts.views_of} views (∓: what the others may change)"
 
 
-def remarks(data: ProbeRecord, verbose: bool) -> list[Line]:
-    """Remarks on what failed and what is not known; verbose: every caution."""
-    levels = ("failure", "open", "caution") if verbose else ("failure", "open")
-    return [line for line in findings(data) if line.level in levels]
+def remarks(data: ProbeRecord) -> list[Line]:
+    """Remarks on what failed and what is not known, without cautions, which the report has."""
+    return [line for line in findings(data) if line.level in ("failure", "open")]
 
 
 def _end(end: Eigenvalue) -> str:

@@ -111,7 +111,7 @@ def test_stages_are_kept_for_the_same_data_question_state_and_formulas_alone(the
 
     monkeypatch.setattr("analysis.probe.command.measure", measure)
     words, path = ["probe", str(there / "checkpoint.pt"), *QUICK], there / "checkpoint.pt"
-    for more in ([], ["--verbose"], ["--seed", "1"], ["--loss", "3dgs", "--max-views", "2"], ["--end-products", "50"]):
+    for more in ([], ["--strict"], ["--seed", "1"], ["--loss", "3dgs", "--max-views", "2"], ["--end-products", "50"]):
         assert main([*words, *more]) == 2
     loaded = load_checkpoint(path)
     training, config = loaded.training, loaded.training.config

@@ -16,7 +16,7 @@ from analysis.records.findings import findings, of_slice
 from analysis.records.json_files import plain
 from analysis.records.records import ProbeRecord, SliceRecord, read_record, record_folder, write_data
 from analysis.records.run_files import read_trajectory
-from analysis.records.tables import family_table, probe_table
+from analysis.records.tables import family_table, number_rows
 from landscape.errors import InputError
 from tests import recorded
 from tests.figures.test_trajectory_figure import rows
@@ -365,9 +365,7 @@ def test_a_record_changed_anywhere_is_read_or_refused_in_a_sentence(tmp_path, na
         read += 1
         if isinstance(record.data, ProbeRecord):
             said = findings(record.data)
-            assert said and probe_table(record.data).row_count and family_table(record.data).row_count is not None, (
-                place
-            )
+            assert said and number_rows(record.data) and family_table(record.data).row_count is not None, place
         else:
             assert isinstance(record.data, SliceRecord)
             assert of_slice(record.data.slice, record.data.provenance) is not None
