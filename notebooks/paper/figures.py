@@ -1,7 +1,7 @@
 """Figures of the study, and their captions.
 
 OUT/claims, predictors      the effects behind the verdicts, and what goes with the score (`notebooks.paper.effect_figures`)
-OUT/budget                  after Fig. 8: PSNR on held-out views against the time of a training
+OUT/budget                  after Fig. 8: PSNR on held-out views and the time of a training
 OUT/axes                    after Tables 2 and 4: what the axes of StableGS's probes gain, alone and together
 OUT/index                   after Fig. 7: the anisotropy index over the steps, with the band of the seeds
 OUT/captions.md             a caption for each, and the ten verdicts, written from the numbers
@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -25,7 +24,6 @@ from notebooks.paper.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE,
 from splat.model.untrusted import replacing
 
 RESULTS = Path(__file__).parents[1] / "results"
-LETTER, ROW = 4.4, 8.5  # points: as wide as a letter of a name on the average, and as high
 BUDGET = 1.3  # the paper's time of StableGS over that of 3DGS, Sec. 4.3
 VIEWPOINTS = {"occlusion": "edge_rotation", "interpolation": "interpolation", "parallax": "parallax"}
 ONLY = {  # one way to move a viewpoint, beside the probes of attributes
@@ -97,83 +95,32 @@ def method_words(method: str) -> str:
 
 
 def draw_budget(rows: pd.DataFrame) -> Figure:
-    """A dot for each seed, a cross of 95% intervals for each method."""
+    """A row for each method, the best on top: score and time, a dot for each seed, mean and 95% interval."""
+    methods = sorted(_methods(rows), key=lambda method: Interval.of(numbers(rows, SCORE, method)).value)
     with style():
-        figure = new_figure(3.6, 6.8)
-        axes = figure.add_subplot()
-        axes.set_xscale("log")
-        axes.axvline(BUDGET, color=UNDETERMINED, linewidth=0.8, linestyle="--")
-        places, lines = [], []
-        for method in _methods(rows):
+        figure = new_figure(0.9 + 0.17 * len(methods), 6.8)
+        left, right = figure.subplots(1, 2, sharey=True)
+        right.set_xscale("log")
+        right.axvline(BUDGET, color=UNDETERMINED, linewidth=0.8, linestyle="--")
+        for place, method in enumerate(methods):
             time, score = _time(rows, method), numbers(rows, SCORE, method)
             colour = VERMILION if method.startswith(STABLE) else BLUE
-            axes.plot(time.reindex(score.index), score, ".", color=colour, markersize=3, alpha=0.5)
-            x, y = Interval.of(list(np.log(time))).exp(), Interval.of(score)
-            if y.n >= LEAST:  # two seeds bound next to nothing
-                low, high = max(x.low, x.value / 10), min(x.high, 10 * x.value)
-                axes.hlines(y.value, low, high, color=colour, linewidth=1)
-                axes.vlines(x.value, y.low, y.high, color=colour, linewidth=1)
-                lines += [(low, y.value, high, y.value), (x.value, y.low, x.value, y.high)]
-            places.append((x.value, y.value, method, colour))
-        axes.margins(x=0.12)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set(ylabel="PSNR on held-out views (dB)")
-        axes.set_xlabel(
-            f"processor time over that of 3DGS (×); dashed: {BUDGET}, the paper's StableGS\n"
-            "dots: seeds; crosses: 95% intervals of both means"
-        )
-        axes.set_title(_of_budget(rows, short=True), loc="left")
-        axes.grid(True)
-        _label(axes, places, lines)
+            means = Interval.of(score), Interval.of(list(np.log(time))).exp()
+            for axes, seeds, mean in zip((left, right), (score, time), means, strict=True):
+                axes.plot(seeds, [place] * len(seeds), ".", color=colour, markersize=3, alpha=0.5)
+                axes.plot(mean.value, place, "o", color=colour, markersize=3.5)
+                if mean.n >= LEAST:  # two seeds bound next to nothing
+                    axes.hlines(place, mean.low, mean.high, color=colour, linewidth=1)
+        right.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        right.xaxis.set_major_formatter("{x:g}")
+        right.xaxis.set_minor_formatter(NullFormatter())
+        left.set_yticks(range(len(methods)), [literal(method_words(method)) for method in methods])
+        left.set_xlabel("PSNR on held-out views (dB)\nsmall dots: seeds; lines: 95% intervals of the means")
+        right.set_xlabel(f"processor time over that of 3DGS (×)\ndashed: {BUDGET}, the paper's StableGS")
+        left.set_title(_of_budget(rows, short=True), loc="left")
+        for axes in (left, right):
+            axes.grid(True, axis="x")
     return figure
-
-
-def _label(
-    axes: Axes, places: list[tuple[float, float, str, str]], lines: list[tuple[float, float, float, float]]
-) -> None:
-    """Write each name at its point or as near as others leave room, with a line to the point where it is not beside it.
-
-    places: x, y, name, colour; lines: ends x, y, x, y of what they keep clear of.  A letter is half as wide as high.
-    """
-    width, height = (72 * size for size in (6.8 * 0.88, 3.6 * 0.8))  # of the axes, points
-    (left, right), (low, high) = np.log(axes.get_xlim()), axes.get_ylim()
-
-    def place(x: float, y: float) -> tuple[float, float]:
-        return float(width * (np.log(x) - left) / (right - left)), height * (y - low) / (high - low)
-
-    points = [place(x, y) for x, y, *_ in places]
-    taken: list[tuple[float, ...]] = [(x - 3, y - 3, x + 3, y + 3) for x, y in points]
-    taken += [(*place(x0, y0), *(end + 1 for end in place(x1, y1))) for x0, y0, x1, y1 in lines]
-    for (px, py), (x, y, name, colour) in zip(points, places, strict=True):
-        words = method_words(name)
-        size = len(words) * LETTER
-        options = [
-            (dx if side > 0 else -dx - size, dy)
-            for away in range(12)
-            for dy in (away * ROW, -away * ROW)
-            for dx in (5 + 4 * away,)
-            for side in (1, -1)
-        ]
-
-        def box(at: tuple[float, float], px=px, py=py, size=size) -> tuple[float, float, float, float]:
-            return px + at[0], py + at[1] - ROW / 2, px + at[0] + size, py + at[1] + ROW / 2
-
-        free = [at for at in options if _is_free(box(at), taken, width, height)]
-        dx, dy = free[0] if free else options[0]
-        taken.append(box((dx, dy)))
-        line = {"arrowstyle": "-", "color": "0.75", "linewidth": 0.4, "shrinkA": 1, "shrinkB": 2}
-        axes.annotate(
-            literal(words), (x, y), xytext=(dx if dx > 0 else dx + size, dy), textcoords="offset points", va="center",
-            ha="left" if dx > 0 else "right", color=colour, arrowprops=line if dy else None,
-        )  # fmt: skip
-
-
-def _is_free(box: Sequence[float], taken: Sequence[Sequence[float]], width: float, height: float) -> bool:
-    x0, y0, x1, y1 = box
-    inside = x0 >= 0 and x1 <= width and y0 >= 0 and y1 <= height
-    return inside and not any(x0 < b[2] and b[0] < x1 and y0 < b[3] and b[1] < y1 for b in taken)
 
 
 def draw_axes(rows: pd.DataFrame) -> Figure:
@@ -207,19 +154,16 @@ def draw_axes(rows: pd.DataFrame) -> Figure:
 
 def draw_index(along: pd.DataFrame) -> Figure:
     """The median of each method's seeds, and the band from the least to the largest."""
-    known = pd.DataFrame(along[along["eigenvalue_ratio"].notna()])
+    known = along.dropna(subset="eigenvalue_ratio").assign(eigenvalue_ratio=along["eigenvalue_ratio"].abs())
     methods = known["run"].astype(str).str.split("/").str[0]
     with style():
         figure = new_figure(2.6)
         axes = figure.add_subplot()
         axes.set_yscale("log")
         for method, colour in zip(dict.fromkeys(methods), RUNS):
-            part = pd.DataFrame(known[methods == method])
-            steps = sorted(set(part["step"]))
-            values = [np.abs(part.loc[part["step"] == step, "eigenvalue_ratio"].to_numpy(float)) for step in steps]
-            low, middle, high = ([float(of(each)) for each in values] for of in (np.min, np.median, np.max))
-            axes.fill_between(steps, low, high, color=colour, alpha=0.25, linewidth=0)
-            axes.plot(steps, middle, "-o", color=colour, markersize=2, label=literal(method))
+            band = known[methods == method].groupby("step")["eigenvalue_ratio"].agg(["min", "median", "max"])
+            axes.fill_between(band.index, band["min"], band["max"], color=colour, alpha=0.25, linewidth=0)
+            axes.plot(band.index, band["median"], "-o", color=colour, markersize=2, label=literal(method))
         axes.set(xlabel="step", ylabel="|λmax / λmin|")
         axes.grid(True)
         axes.legend()
