@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
+from analysis.records.provenance import require_alike
 from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import ProbeRecord, Record, SliceRecord, read_record
 from analysis.records.run_files import CHECKPOINT
@@ -106,13 +107,7 @@ def require_same_function(runs: Sequence[Path]) -> None:
             run: getattr(data.provenance if key == "views" else data.objective, key) for run, data in records.items()
         }
         known = {run: value for run, value in found.items() if value}
-        for run, value in known.items():
-            first, of_first = next(iter(known.items()))
-            if value != of_first:
-                raise InputError(
-                    f"expected runs with the same {what}, as their landscapes are not comparable else, got {of_first} in "
-                    f"{first} and {value} in {run}; draw them apart"
-                )
+        require_alike(what, known, "draw them apart")
 
 
 def landscape_of(run: Path) -> Plane:

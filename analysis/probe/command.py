@@ -182,7 +182,7 @@ def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjectiv
     return (
         f"{scene.name}, {steps_made(training.step, bool(checkpoint.origin))}: "
         f"{views} views of {camera.width} x {camera.height} px, "
-        f"{counts.active_gaussians:,} of {counts.gaussians:,} Gaussians in sight, "
+        f"{counts.visible_gaussians:,} of {counts.gaussians:,} Gaussians in sight, "
         f"{counts.active_parameters:,} active parameters"
     )
 

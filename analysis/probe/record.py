@@ -34,7 +34,7 @@ def probe_record(
     """The record without the families.  timing: seconds of the stages so far."""
     left_out = found.left_out
     # the others' blocks have full rank: mean 3, log-scales 3, quaternion 3, logit 1
-    seen = {"sh": found.rank - 10 * objective.counts.active_gaussians}
+    seen = {"sh": found.rank - 10 * objective.counts.visible_gaussians}
     of_loss = UNSET if left_out is None else sampling_error(left_out.losses, left_out.population)
     return ProbeRecord(
         objective=objective_of(objective, found.value, found.gradient_norm, of_loss),
@@ -250,8 +250,8 @@ def _skipped(found: Measured, objective: SceneObjective) -> dict[str, Skip]:
     """
     counts, probes = objective.counts, [trace.probes for trace in found.traces.values()]
     skipped = {
-        "gaussians_out_of_sight": counts.gaussians - counts.active_gaussians,
-        "sh_bands_not_in_use": (counts.sh_degree + 1) ** 2 - (counts.active_sh_degree + 1) ** 2,
+        "gaussians_out_of_sight": counts.gaussians - counts.visible_gaussians,
+        "sh_bands_not_in_use": (counts.sh_degree_stored + 1) ** 2 - (counts.sh_degree_active + 1) ** 2,
         "entries_behind_opaque_fronts": sum(view.intersections_behind for view in objective.linearized),
         "tiles_of_zero_cotangent": sum(view.dark_tiles for view in objective.linearized),
         "products_of_views_not_concerned": found.spared,

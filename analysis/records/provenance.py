@@ -5,7 +5,7 @@ import os
 import platform
 import shlex
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -102,6 +102,17 @@ def require_seed(seed: int) -> None:
     """InputError where it is out of range."""
     if not 0 <= seed < 2**63:
         raise InputError(f"expected a seed in [0, 2^63), got {seed}")
+
+
+def require_alike(what: str, of_runs: Mapping[Any, Any], remedy: str) -> None:
+    """InputError where runs differ in what makes their curvatures those of one function.  of_runs: by run."""
+    for run, value in of_runs.items():
+        first, of_first = next(iter(of_runs.items()))
+        if value != of_first:
+            raise InputError(
+                f"expected runs with the same {what}, as their curvatures are not comparable else, got {of_first} in {first} "
+                f"and {value} in {run}; {remedy}"
+            )
 
 
 def require_own(found: Maybe[Fingerprint | None], state: str, path: Path, remedy: str) -> None:

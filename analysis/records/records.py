@@ -363,14 +363,4 @@ def objective_of(
 
 def counts_of(active: "ActiveCounts", views_of: int | None, **work: int) -> Counts:
     """Counts of a record.  views_of: None where no views were left out; work: the other fields of `Counts`."""
-    return Counts(
-        gaussians=active.gaussians,
-        visible_gaussians=active.active_gaussians,
-        parameters=active.parameters,
-        active_parameters=active.active_parameters,
-        sh_degree_stored=active.sh_degree,
-        sh_degree_active=active.active_sh_degree,
-        views=active.views,
-        views_of=UNSET if views_of is None else views_of,
-        **work,
-    )
+    return Counts(**vars(active), views_of=UNSET if views_of is None else views_of, **work)

@@ -24,6 +24,7 @@ from analysis.console.plain import say
 from analysis.records.findings import of_budgets, of_checks, unresolved
 from analysis.records.json_files import json_text, plain
 from analysis.records.page.report import pictures_in, template_environment
+from analysis.records.provenance import require_alike
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import COMPARISON, Comparison
@@ -82,7 +83,8 @@ def run_compare(options: CompareOptions) -> int:
         )
         for path, label, checkpoint in zip(paths, labels, checkpoints)
     ]
-    require_same_loss(runs)
+    losses = {run.label: run.data.objective.loss for run in runs}
+    require_alike("loss", losses, "probe all of them with --loss 3dgs")
     named = [replace(group, label=os.path.relpath(Path(group.label).resolve(), common)) for group in groups]
     _write(runs, named, identical(labels, checkpoints), notes, options.out or common / "compare")
     return 0
@@ -108,24 +110,7 @@ def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint], *, tr
     if trained_alike:
         demanded["loss"] = lambda c: c.training.config.loss
     for what, of in demanded.items():
-        first = of(checkpoints[0])
-        for label, checkpoint in zip(labels, checkpoints, strict=True):
-            if of(checkpoint) != first:
-                raise InputError(
-                    f"expected runs with the same {what}, as their curvatures are not comparable else, got {first} in "
-                    f"{labels[0]} and {of(checkpoint)} in {label}; compare them apart"
-                )
-
-
-def require_same_loss(runs: Sequence[Run]) -> None:
-    """InputError where the records are of different losses."""
-    losses = [run.data.objective.loss for run in runs]
-    for run, loss in zip(runs, losses, strict=True):
-        if loss != losses[0]:
-            raise InputError(
-                f"expected probes of the same loss, as curvatures are not comparable else, got {losses[0]} in {runs[0].label} "
-                f"and {loss} in {run.label}; probe all of them with --loss 3dgs"
-            )
+        require_alike(what, dict(zip(labels, map(of, checkpoints), strict=True)), "compare them apart")
 
 
 def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:

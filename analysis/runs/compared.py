@@ -72,7 +72,7 @@ def _as_probed(made: Provenance) -> Foreign:
 def probed(run: Path, checkpoint: Checkpoint) -> bool:
     """Whether there is a record of this checkpoint, by its renderer, of its views or some of them.
 
-    The loss is compared between the records (`require_same_loss`).
+    The loss is compared between the records (`analysis.runs.compare`).
     """
     made = _made(probe_folder(run))
     if made is None or not made.fingerprint:

@@ -158,7 +158,7 @@ class Trajectory:
         return {
             "state": "coarse" if self.settings.quick else "whole",
             "note": "",
-            "visible_gaussians": counts.active_gaussians,
+            "visible_gaussians": counts.visible_gaussians,
             "parameters": counts.active_parameters,
             "matvecs": found.matvecs,
             **_columns(found),

@@ -39,16 +39,16 @@ class NothingInSight(InputError):
 class ActiveCounts:
     """Numbers of Gaussians and parameters, given and active; images do not depend on the others.
 
-    active_gaussians: those that touch a pixel of some view; with keep_unseen all.  parameters: stored numbers of all Gaussians.
+    visible_gaussians: those that touch a pixel of a view; with keep_unseen all.  parameters: stored numbers of all Gaussians.
     active_parameters: those of the active ones in the SH bands in use, less one for the length of each quaternion.
     """
 
     gaussians: int
-    active_gaussians: int
+    visible_gaussians: int
     parameters: int
     active_parameters: int
-    sh_degree: int
-    active_sh_degree: int
+    sh_degree_stored: int
+    sh_degree_active: int
     views: int
 
 
@@ -157,7 +157,7 @@ class SceneObjective:
     @property
     def loss_of_active(self) -> LossSettings:
         """The loss for a scene of the active Gaussians alone: weights of R are scaled, since its means are over all."""
-        share, loss = self.counts.active_gaussians / self.counts.gaussians, self.loss_settings
+        share, loss = self.counts.visible_gaussians / self.counts.gaussians, self.loss_settings
         return replace(loss, opacity_reg=share * loss.opacity_reg, scale_reg=share * loss.scale_reg)
 
     def loss(self, flat: Float[Tensor, " p"]) -> float:

@@ -76,7 +76,14 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         swapping = beside.submit(_fragility, objective, found, options.seed)
         with stages.stage("maps") as report:
             shades = {name: found.shade(name) for name in dict.fromkeys((options.shown, *AXES))}
-            panels = _write_panels(folder, objective, found, shades, chosen, report)
+            shares = {name: torch.from_numpy(shade.share(found.values[name].numpy())) for name, shade in shades.items()}
+            shades["error"], panels = error_shade(objective), list[Panel]()  # of the error one scale for all views
+            for index in chosen:
+                maps, psnr = view_maps(objective, index, shares, shades["error"])
+                name, file = objective.views[index].name, f"view-{index:03d}"
+                write_maps(folder / f"{file}.npz", maps)
+                panels.append(Panel(name=name, place=index, file=file, psnr=psnr))
+                report(len(panels), len(chosen), "views")
         with stages.stage("steepest") as report:
             shown = _write_ends(folder, objective, found, report)
         with stages.stage("files"):
@@ -117,27 +124,6 @@ def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
 def _fragility(objective: SceneObjective, found: Fields, seed: int) -> Fragility:
     generator = torch.Generator().manual_seed(seed)
     return fragility(objective, found.values, found.sights, generator, lambda *_: None)
-
-
-def _write_panels(
-    folder: Path,
-    objective: SceneObjective,
-    found: Fields,
-    shades: dict[str, Shade],
-    chosen: Sequence[int],
-    report: Progress,
-) -> list[Panel]:
-    """Write the maps of the chosen views; adds to the shades the scale of the error, which all views share."""
-    names, panels = list(shades), []
-    shares = {name: torch.from_numpy(shades[name].share(found.values[name].numpy())) for name in names}
-    shades["error"] = error_shade(objective)
-    for done, index in enumerate(chosen):
-        maps, psnr = view_maps(objective, index, shares, shades["error"])
-        file = f"view-{index:03d}"
-        write_maps(folder / f"{file}.npz", maps)
-        panels.append(Panel(name=objective.views[index].name, place=index, file=file, psnr=psnr))
-        report(done + 1, len(chosen), "views")
-    return panels
 
 
 def _write_ends(folder: Path, objective: SceneObjective, found: Fields, report: Progress) -> list[Steepest]:

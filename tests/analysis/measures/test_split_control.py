@@ -81,7 +81,7 @@ def test_the_split_changes_opacities_and_sizes_alone_and_can_be_repeated() -> No
             assert torch.equal(half.attributes[name], gaussians.attributes[name])
         assert torch.allclose((half.log_scales - gaussians.log_scales).std(dim=1), torch.zeros(12).double())
     once, twice = SceneObjective(gaussians, views), SceneObjective(split, views)
-    assert twice.counts.active_gaussians == 2 * once.counts.active_gaussians
+    assert twice.counts.visible_gaussians == 2 * once.counts.visible_gaussians
     assert twice.loss(twice.active.flat) == pytest.approx(once.loss(once.active.flat), rel=0.02)
 
 

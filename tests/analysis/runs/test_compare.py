@@ -257,7 +257,7 @@ def test_probes_of_other_losses_are_not_compared(runs, capsys, no_pictures):
     path = Path(runs[1]) / "probe/probe.json"
     data = json.loads(path.read_text())
     path.write_text(json.dumps(data | {"objective": data["objective"] | {"loss": "L1 + 0.2 (1 − SSIM)"}}))
-    refused(capsys, runs, "expected probes of the same loss", "L1 + 0.2 (1 − SSIM) in sam/0", "--loss 3dgs")
+    refused(capsys, runs, "expected runs with the same loss", "L1 + 0.2 (1 − SSIM) in sam/0", "--loss 3dgs")
 
 
 def test_runs_trained_with_other_losses_are_probed_with_that_of_3dgs(runs, capsys, monkeypatch, no_pictures):

@@ -77,13 +77,13 @@ def test_exactly_the_gaussians_that_touch_no_pixel_are_removed():
         for product in (held.gradient, held.hvp(random_like((gaussians.flat.numel(), 1), 1))[:, 0]):
             for value in gaussians.with_flat(product.contiguous()).attributes.values():
                 assert not value[~scene.mask].any()
-    assert scene.counts.gaussians == 30 and scene.counts.active_gaussians == int(scene.mask.sum()) == len(scene.active)
+    assert scene.counts.gaussians == 30 and scene.counts.visible_gaussians == int(scene.mask.sum()) == len(scene.active)
 
 
 def test_counts_say_what_is_left():
     scene = objective(random_gaussians(10, 2, spread=0.3), sh_degree=1)
     counts, left = scene.counts, len(scene.active)
-    assert (counts.sh_degree, counts.active_sh_degree, counts.views) == (2, 1, 2)
+    assert (counts.sh_degree_stored, counts.sh_degree_active, counts.views) == (2, 1, 2)
     assert counts.parameters == 10 * (11 + 27)
     assert counts.active_parameters == left * (11 + 12) - left
 
