@@ -21,9 +21,9 @@ import pandas as pd
 import torch
 from jaxtyping import Float
 from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
+from analysis.bench.tables import rich_table
 from analysis.commands.uses.options import GEOMETRY, TWICE, NextViewOptions
 from analysis.console.drawing import draw
 from analysis.console.plain import say
@@ -161,14 +161,9 @@ def geometry(
 
 
 def _conclude(table: pd.DataFrame, options: NextViewOptions, out: Path) -> None:
-    console, shown = Console(), Table(caption=f"behind: the best by {options.by} ± its error over Gaussians")
-    columns = (options.by, *GEOMETRY)
-    for title in ("view", *columns, "behind", "pick"):
-        shown.add_column(title, justify="left" if title == "view" else "right")
-    for row in table.reset_index().to_dict("records"):
-        pick, behind = f"{row['pick']:.0f}" if row["pick"] > 0 else "", quantity(row["behind"], row["error"])
-        shown.add_row(row["view"], *(quantity(row[name]) for name in columns), behind, pick)
-    console.print(shown)
+    console, behind = Console(), [quantity(*each) for each in zip(table["behind"], table["error"], strict=True)]
+    shown = table.assign(behind=behind).reset_index().filter(["view", options.by, *GEOMETRY, "behind", "pick"])
+    console.print(rich_table(shown, f"behind: the best by {options.by} ± its error over Gaussians"))
     names, equal = ", ".join(table.index[table.pick.notna()]), [*table.index[table.behind <= TWICE * table.error]]
     say(f"next, by {options.by}: {names}", console=console)
     if len(equal) > 1:

@@ -23,9 +23,9 @@ import pandas as pd
 import torch
 from jaxtyping import Float64, Int64
 from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
+from analysis.bench.tables import rich_table
 from analysis.commands.convert import own_file
 from analysis.commands.uses.options import PruneOptions
 from analysis.console.drawing import draw
@@ -256,15 +256,12 @@ def _conclude(
             f"further columns: {measure.split('_')[0]} PSNR lost at that share removed, dB; ±: the standard deviation over "
             "seeds of the steps after it.  All of one training"
         )
-    table = Table()
-    titles = [f"{removed:.0%}{f', {steps} steps' if steps else ''}" for removed, steps in columns]
-    for title in ("score", "rank", *titles):
-        table.add_column(title, justify="left" if title == "score" else "right")
+    table = pd.DataFrame({"score": SCORES, "rank": ranks.loc[TRUTH, [*SCORES]].to_numpy(float)})
     losses = [lost(curve, *at, measure) for at in columns] if curve is not None else []
-    for name in SCORES:
-        cells = [quantity(*_over_seeds(loss[name].to_numpy(float))) for loss in losses]
-        table.add_row(name, quantity(ranks.loc[TRUTH, name]), *cells)
-    Console().print(table)
+    for (removed, steps), loss in zip(columns, losses, strict=True):
+        cells = [quantity(*_over_seeds(loss[name].to_numpy(float))) for name in SCORES]
+        table[f"{removed:.0%}{f', {steps} steps' if steps else ''}"] = cells
+    Console().print(rich_table(table, ""))
     for (removed, steps), loss in zip(columns, losses, strict=True):
         say(f"{removed:.0%} removed, {steps} steps after: {verdict(loss)}")
     scored = ", ".join(
