@@ -74,7 +74,7 @@ class GridEvaluations:
         self.has_pieces = self._here is not None
         self.value = np.full(len(points), np.nan)
         self.known, self.discontinuous = np.zeros((2, len(points)), bool)
-        self._digest = f"{slice_digest(self._center, self._spans, points)} {self.has_pieces}"
+        self._digest = f"{slice_digest(self._center, directions, points)} {self.has_pieces}"
         self._stored = self._read(store) if store is not None else {}
 
     def require(self, points: Iterable[int]) -> None:
@@ -139,5 +139,5 @@ def slice_digest(center: Tensor, directions: Tensor, points: Tensor) -> str:
     digest = hashlib.sha256()
     for tensor in (center, directions, points):
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}\n".encode())
-        digest.update(tensor.detach().double().cpu().contiguous().numpy().tobytes())
+        digest.update(tensor.detach().cpu().contiguous().numpy())
     return digest.hexdigest()

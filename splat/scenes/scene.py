@@ -186,7 +186,7 @@ def _read(root: Path, images: str | None, points: bool) -> _Found:
         return _Found("blender", photos, notes=[*notes, *_not_read(root, *(name for _, name in BLENDER_FILES))])
     for name in (SINGLE_FILE, BLENDER_FILES[0][1]):
         if (root / name).is_file():
-            photos, cloud, background, notes = read_transforms(root, root / name, images)
+            photos, cloud, background, notes = read_transforms(root, root / name, images, points=points)
             return _Found("transforms", photos, cloud, background, [*notes, *_not_read(root, name)])
     if is_dtu(root):
         return _Found("dtu", read_dtu(root))

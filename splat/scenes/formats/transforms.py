@@ -69,9 +69,12 @@ def read_blender(root: Path) -> tuple[list[Photo], list[str]]:
 
 
 def read_transforms(
-    root: Path, path: Path, images: str | None = None
+    root: Path, path: Path, images: str | None = None, *, points: bool = True
 ) -> tuple[list[Photo], Points | None, list[float] | None, list[str]]:
-    """Photographs sorted by name, the points of `ply_file_path` and the background, where the file has them; and notes."""
+    """Photographs sorted by name, the points of `ply_file_path` and the background, where the file has them; and notes.
+
+    points: whether to read them.
+    """
     data = _load(path)
     data["frames"].sort(key=lambda frame: frame["file_path"])
     paths = [] if images is not None else [image_named(inside(root, frame["file_path"])) for frame in data["frames"]]
@@ -80,13 +83,13 @@ def read_transforms(
         paths = [_in_folder(folder, frame["file_path"]) for frame in data["frames"]]
     subsets = _subsets(data, path)
     photos, skipped = _photos(path, data, paths, subsets)
-    points = None
-    if cloud := _file(data, "ply_file_path", path):
-        points = read_points(inside(root, cloud), tuple(_name(frame) for frame in data["frames"]))
+    cloud = None
+    if points and (named := _file(data, "ply_file_path", path)):
+        cloud = read_points(inside(root, named), tuple(_name(frame) for frame in data["frames"]))
     notes = [*_skipped(skipped, len(photos)), *_unused(data, path.name)]
     if left := sorted({photo.name for photo in photos} - subsets.keys()) if subsets else []:
         notes.append(f"{len(left)} frames are in neither list of {path.name} to train and to test, such as {left[0]}")
-    return photos, points, data.get("background"), notes
+    return photos, cloud, data.get("background"), notes
 
 
 def _skipped(names: Sequence[str], there: int) -> list[str]:
