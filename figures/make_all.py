@@ -2,8 +2,6 @@
 
 import argparse
 from collections.abc import Collection
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,9 +9,8 @@ from pathlib import Path
 from analysis.console.failures import program
 from analysis.records.records import ProbeRecord, Record, read_record
 from figures import places, slice1d, slice2d, spectrum, surface, traces
-from figures.scripts import folder_script
+from figures.scripts import drawn_by, folder_script
 from figures.style import save
-from landscape.errors import TooLittleMemory
 
 FIGURES = {
     "places": places.draw,
@@ -46,13 +43,7 @@ def draw_probe(folder: str | Path, suffix: str = "png", only: Collection[str] = 
     # what the processes are handed: no figure shows the eigenvectors, by far the largest
     used = {group: arrays for group, arrays in record.arrays.items() if group != "eigenvectors"}
     draw = partial(_draw, replace(record, arrays=used), suffix)
-    if min(processes, len(names)) <= 1:
-        return [draw(name) for name in names]
-    with ProcessPoolExecutor(min(processes, len(names))) as pool:
-        try:
-            return list(pool.map(draw, reversed(names)))[::-1]  # the slow ones first
-        except BrokenProcessPool as error:
-            raise TooLittleMemory("a process that draws was ended, as Linux does where memory runs out") from error
+    return drawn_by(processes, draw, names)  # the last ones, which are slow, first
 
 
 def _draw(record: Record, suffix: str, name: str) -> Path:

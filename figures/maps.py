@@ -9,7 +9,6 @@ Grey: no splat with a value.  The arrow ends of a scale say that there are value
 """
 
 import math
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,7 @@ from analysis.records.run_files import (
     read_map,
     read_maps,
 )
-from figures.scripts import folder_script
+from figures.scripts import drawn_by, folder_script
 from figures.style import BLACK, BLUE, GREEN, VERMILION, few_decades, literal, new_figure, round_number, save, style
 
 EXTEND: dict[str, Any] = {
@@ -200,11 +199,7 @@ def draw_maps(folder: Path, suffix: str = "png", processes: int = 2) -> list[Pat
     record = read_map(folder)
     jobs = [("view", panel.file) for panel in record.panels] + [("fragility", panel.file) for panel in record.panels]
     jobs += [("steepest", end.file) for end in record.steepest]
-    one = partial(_draw, folder, suffix, record)
-    if min(processes, len(jobs)) <= 1:
-        return [one(job) for job in jobs]
-    with ProcessPoolExecutor(processes) as pool:
-        return list(pool.map(one, jobs))
+    return drawn_by(processes, partial(_draw, folder, suffix, record), jobs)
 
 
 def _draw(folder: Path, suffix: str, record: MapRecord, job: tuple[str, str]) -> Path:

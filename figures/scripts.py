@@ -7,12 +7,15 @@ stderr.
 import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from figures.style import PAPER, SUFFIXES, save
-from landscape.errors import InputError
+from landscape.errors import InputError, TooLittleMemory
 
 
 def folder_script(
@@ -55,6 +58,17 @@ def table_script(draw: Callable[[Path], Iterable[tuple[str, Figure]]], what: str
             ) from None
 
     return print_files(drawn)
+
+
+def drawn_by(processes: int, draw: Callable[[Any], Path], names: Sequence[Any]) -> list[Path]:
+    """draw(name) of all names, the last ones first.  TooLittleMemory where the system ends one of the processes."""
+    if min(processes, len(names)) <= 1:
+        return [draw(name) for name in names]
+    with ProcessPoolExecutor(min(processes, len(names))) as pool:
+        try:
+            return list(pool.map(draw, reversed(names)))[::-1]
+        except BrokenProcessPool as error:
+            raise TooLittleMemory("a process that draws was ended, as Linux does where memory runs out") from error
 
 
 def print_files(draw: Callable[[], Iterable[Path]]) -> int:

@@ -153,7 +153,8 @@ def measure_per_attribute(
             control = split_control(
                 objective.active, [view.camera for view in objective.views], objective.background, objective.settings
             )
-            scenes["split"] = _with(objective, control)
+            same = objective.loss_of_active, objective.background, objective.settings
+            scenes["split"] = SceneObjective(control.gaussians, objective.views, *same)
     unit, scale = _metric(options.metric, objective, training)
     streams: dict[tuple[SceneName, schema.Operator], torch.Generator] = {
         (scene, operator): spawn(generator)
@@ -170,12 +171,6 @@ def measure_per_attribute(
             count = len(scenes[scene].active)
             rows += [FamilyRow(scene, operator, block, count, dim, found) for block, dim, found in measured]
     return FamilyFindings(tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)), options.metric, unit)
-
-
-def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:
-    """Objective of the split Gaussians: the same loss over the same views."""
-    settings = objective.loss_of_active, objective.background, objective.settings
-    return SceneObjective(control.gaussians, objective.views, *settings)
 
 
 def _metric(

@@ -37,8 +37,6 @@ class SweepOptions:
     """Run these cells alone, by SCENE/METHOD/SEED or the beginning of it, such as fern/3dgs; may be repeated."""
     jobs: int = 1
     """Runs at once, each on its share of the processors."""
-    probe: bool = False
-    """Also probe every run after its training, as a table [probe] in the file does, which may hold options of the probe."""
 
 
 @dataclass(frozen=True)

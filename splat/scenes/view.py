@@ -190,3 +190,13 @@ def inside_image(
     near, far = depth_range or (0.0, float("inf"))
     u, v = pixel.unbind(-1)
     return (z > near) & (z < far) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+
+
+def transparent_at(view: View, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Mask of the points on a pixel of the view whose alpha is 0."""
+    found = torch.zeros(len(xyz), dtype=torch.bool)
+    if view.alpha is not None:
+        inside = inside_image(view.camera, xyz)
+        u, v = pixel_coordinates(view.camera, xyz[inside])[0].long().unbind(-1)
+        found[inside] = view.alpha[v, u] == 0
+    return found

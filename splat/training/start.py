@@ -28,7 +28,7 @@ from typing import Literal
 import numpy as np
 import scipy
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
@@ -38,7 +38,7 @@ from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.scenes.scene import Scene
 from splat.scenes.sfm.triangulation import triangulated_points
-from splat.scenes.view import Frame, Points, View, inside_image, lifted, pixel_coordinates
+from splat.scenes.view import Frame, Points, View, inside_image, lifted, pixel_coordinates, transparent_at
 
 Source = Literal["scene", "points", "triangulated", "dense", "random", "box"]
 OPACITY = 0.1
@@ -202,20 +202,10 @@ def points_in_common_volume(
         sightings = torch.stack([inside_image(v.camera, xyz, r) for v, r in zip(views, ranges)]).sum(dim=0)
         fit = sightings >= needed
         for view in views:
-            fit &= ~_transparent(view, xyz)
+            fit &= ~transparent_at(view, xyz)
         kept.append((xyz[fit], rgb[fit]))
         draws += n
     return Points(torch.cat([xyz for xyz, _ in kept])[:n], torch.cat([rgb for _, rgb in kept])[:n])
-
-
-def _transparent(view: View, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    """Mask of the points on a pixel of the view whose alpha is 0."""
-    found = torch.zeros(len(xyz), dtype=torch.bool)
-    if view.alpha is not None:
-        inside = inside_image(view.camera, xyz)
-        u, v = pixel_coordinates(view.camera, xyz[inside])[0].long().unbind(-1)
-        found[inside] = view.alpha[v, u] == 0
-    return found
 
 
 def _random_batch(

@@ -56,7 +56,7 @@ def run_sweep(options: SweepOptions) -> int:
     """Run what is missing; returns the exit code."""
     if options.jobs < 1:
         raise InputError(f"expected at least 1 job, got {options.jobs}")
-    whole = read_sweep(options.file, options.out, options.probe)
+    whole = read_sweep(options.file, options.out)
     sweep = only(whole, options.only)
     to_do = {cell.name: missing(cell, sweep) for cell in sweep.cells}
     sweep.out.mkdir(parents=True, exist_ok=True)

@@ -92,22 +92,22 @@ class Sweep:
         return list(dict.fromkeys(cell.scene for cell in self.cells))
 
 
-def read_sweep(file: Path, out: Path | None = None, probe: bool = False) -> Sweep:
-    """The sweep in a file; out and probe go before what the file says.  ValueError names the key that is wrong."""
+def read_sweep(file: Path, out: Path | None = None) -> Sweep:
+    """The sweep in a file; out goes before what the file says.  ValueError names the key that is wrong."""
     if not file.is_file():
         raise FileNotFoundError(
             f"expected a sweep in TOML at {file}, found no such file; landscape sweep --help has an example"
         )
     content = read_toml(file, "a sweep in TOML")
     try:
-        return _sweep(content, file, out, probe)
+        return _sweep(content, file, out)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
 
 
-def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -> Sweep:
+def _sweep(content: dict[str, Any], file: Path, out: Path | None) -> Sweep:
     tables = {name: _tables(content.pop(name, None), name) for name in ("scenes", "methods")}
-    table = content.pop("probe", {} if probe else None)
+    table = content.pop("probe", None)
     top = _values(content, TOP | TRAINING, "", file.parent)
     seeds = top.pop("seeds", (0,))
     if not seeds or len(set(seeds)) < len(seeds):

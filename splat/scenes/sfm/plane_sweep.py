@@ -26,7 +26,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from splat.model.camera import Camera
-from splat.scenes.view import Points, View, lifted, pixel_coordinates
+from splat.scenes.view import Points, View, lifted, pixel_coordinates, transparent_at
 
 LARGEST = 400  # px, of the longer side
 STRIDE = 2
@@ -163,7 +163,7 @@ def _fused(views: Sequence[View], maps: Sequence[DepthMap]) -> Points:
         xyz = lifted(own.camera, pixel, own.z[row, column].double())
         agree = torch.stack([_confirmed(own.camera, pixel, xyz, other) for other in maps])
         agree[i] = True
-        found = (agree.sum(dim=0) >= 2) & _opaque(view, xyz)
+        found = (agree.sum(dim=0) >= 2) & ~transparent_at(view, xyz)
         for other, covers, confirmed in zip(maps, covered, agree):
             _cover(covers, other.camera, xyz[found & confirmed])
         fx, fy = view.camera.width / own.camera.width, view.camera.height / own.camera.height
@@ -188,14 +188,6 @@ def _confirmed(
     back, _ = pixel_coordinates(camera, lifted(other.camera, there, measured))
     same = ((measured - z).abs() < MAX_DEPTH * z) & ((back - pixel).norm(dim=1) < MAX_REPROJECTION)
     return inside & (measured > 0) & same
-
-
-def _opaque(view: View, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    """Mask of the points that the view does not show as transparent."""
-    if view.alpha is None:
-        return torch.ones(len(xyz), dtype=torch.bool)
-    u, v = pixel_coordinates(view.camera, xyz)[0].long().unbind(1)
-    return view.alpha[v.clamp(0, view.camera.height - 1), u.clamp(0, view.camera.width - 1)] > 0
 
 
 def _cover(covered: Bool[Tensor, "h w"], camera: Camera, xyz: Float[Tensor, "n 3"]) -> None:

@@ -263,7 +263,8 @@ def test_a_cell_that_fails_does_not_end_the_sweep(finished, folder, tmp_path, mo
 
     ran = []
     monkeypatch.setattr(_Cells, "_command", command)
-    words = ["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path / "out"), "--probe"]
+    probing = written(folder, "[scenes.still]", "[probe]\n[scenes.still]")
+    words = ["sweep", str(probing), "--out", str(tmp_path / "out")]
     assert main(words) == 1
     failed, good = ("still/3dgs/1", "still/3dgs/0"), ("still/asp only/1", "still/asp only/0")
     assert sorted(ran) == sorted([(name, "train") for name in failed + good] + [(name, "probe") for name in good])
@@ -312,7 +313,7 @@ def test_two_sweeps_share_the_cells_and_the_last_writes_all(folder, tmp_path, mo
 
 def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, folder):
     controlled = "[probe]\nsplit_control = true"
-    with_probe = read_sweep(finished.file, probe=True)
+    with_probe = read_sweep(written(folder, "[scenes.still]", "[probe]\n[scenes.still]", "probed.toml"))
     control = read_sweep(written(folder, "[scenes.still]", f"{controlled}\n[scenes.still]"))
     cell = with_probe.cells[0]
     assert missing(cell, finished) == [] and missing(cell, with_probe) == missing(cell, control) == ["probe"]
