@@ -122,7 +122,7 @@ def _run(
             shutil.rmtree(unfinished, ignore_errors=True)
         conclude(data, out, guessed)
         of = options.checkpoint.parent if options.checkpoint.name == CHECKPOINT else options.checkpoint
-        more = " and the same options on its tool and scene" if checkpoint.origin else ""
+        more = ", with the options on its tool and scene" if options.foreign.scene else ""
         say(f"next: open the report in a browser; landscape map {shlex.quote(str(of))}{more}")
     failed = any(check.passed is False for check in data.checks.values())
     return CHECK_FAILED if options.strict and failed else 0

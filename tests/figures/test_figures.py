@@ -21,7 +21,7 @@ from analysis.records.records import read_record
 from analysis.records.run_files import END_MAPS, Steepest
 from figures import make_all, maps, slice2d, spectrum, surface, traces
 from figures.plane import plane
-from figures.style import BLACK, COLUMN, ORANGE, SKY, save, style
+from figures.style import BLACK, BLUE, COLUMN, ORANGE, SKY, VERMILION, save, style
 from landscape.errors import TooLittleMemory
 from tests.recorded import long_numbers, synthetic, written, written_map
 from tests.refusals import refused
@@ -402,7 +402,12 @@ def test_rendered_steps_are_drawn_within_the_axes_however_far_from_the_curvature
     data, arrays = synthetic()
     data["steps"] = dict.fromkeys(data["traces"], 1e-3)
     data["step_rises"] = {name: (10.0 ** (-3 * k), 0.0) for k, name in enumerate(data["traces"])}
-    axes = traces.draw(written(tmp_path / "probe", data, arrays)).axes[0]
+    figure = traces.draw(written(tmp_path / "probe", data, arrays))
+    axes, (legend,) = figure.axes[0], figure.legends
+    looks = {(each.get_label(), each.get_marker(), each.get_color()) for each in legend.get_lines()}
+    assert looks == {
+        ("by curvature, positive", "o", BLUE), ("by curvature, negative", "s", VERMILION), ("rendered", "D", ORANGE),
+    }  # fmt: skip
     low, high = axes.get_xlim()
     drawn = [
         float(np.ravel(line.get_xdata())[0])

@@ -128,12 +128,12 @@ def test_off_a_terminal_every_row_is_a_line_with_the_time_left(original, tmp_pat
 
 
 def test_a_row_says_what_was_done_to_the_gaussians_since_the_one_before(original, tmp_path, capsys):
-    settings = ["start=0", "every=4", "reset_every=11"]  # until half of the 25 steps
+    settings = ["start=0", "stop_share=1", "first_reset=17", "reset_every=100"]
     changes = [word for setting in settings for word in ("--set", f"densify.{setting}")]
     assert main(words(original, tmp_path / "run", *changes)) == 0
     lines = re.findall(r"^step \d+ of .*", capsys.readouterr().err, re.M)
     after = [found[1] if (found := re.search(" after (.*?),", line)) else "" for line in lines]
-    assert after == ["", "density control", "density control and a reset of opacities", ""]
+    assert after == ["", "density control", "density control and a reset of opacities", "density control"]
 
 
 def test_gaussians_that_more_than_triple_in_the_first_tenth_are_said_with_the_reason(original, tmp_path, capsys):
