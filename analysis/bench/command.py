@@ -93,8 +93,6 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
         console.print(rich_table(times[-1].drop(columns="scene"), title))
         taken = f"{view.bytes / 1e6:.1f} MB kept, {workspaces[1] / 1e6:.1f} MB more for a product"
         say(f"memory: {taken}", console=console)
-        if options.bounds:
-            console.print(rich_table(bounds[-1].drop(columns="scene"), "asked for"))
         for tables, name in ((times, "bench.csv"), (bounds, "bounds.csv")):  # what comes next may fail
             write_table(pd.concat(tables, ignore_index=True), options.out / name)
     say(f"{options.out / 'bench.csv'}, {options.out / 'bounds.csv'}", console=console)

@@ -29,5 +29,3 @@ class BenchOptions:
     """Synthetic scenes to measure, GAUSSIANS@WIDTHxHEIGHT in pixels.
     Default: 10k@504x378 100k@504x378; none beside a run or a scene."""
     device: Device = "auto"
-    bounds: bool = False
-    """Print the ratios that the project promises with their bounds, which bounds.csv has."""

@@ -90,16 +90,6 @@ def test_a_bench_records_times_and_the_bounds_that_are_asked(recorded):
     assert (bounds["holds"] == (bounds["measured"] <= limit)).all()
 
 
-def test_bounds_are_printed_where_they_are_asked_for_alone(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(
-        "analysis.bench.command.interleaved", lambda calls, *_, **__: dict.fromkeys(calls, Timing((1.0,)))
-    )
-    for more, printed in (((), False), (("--bounds",), True)):
-        assert main(["bench", "--sizes", str(TINY), "--device", "cpu", "--out", str(tmp_path), *more]) == 0
-        said = capsys.readouterr().out
-        assert ("H v 1 / gradient" in said) == printed and "H v 4" in said and "MB more for a product" in said
-
-
 def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
     from analysis.bench.workloads import workload_of
     from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
