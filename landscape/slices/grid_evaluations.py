@@ -139,5 +139,5 @@ def slice_digest(center: Tensor, directions: Tensor, points: Tensor) -> str:
     digest = hashlib.sha256()
     for tensor in (center, directions, points):
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}\n".encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy())
+        digest.update(tensor.detach().cpu().contiguous().numpy())  # pyright: ignore[reportArgumentType]
     return digest.hexdigest()

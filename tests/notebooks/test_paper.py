@@ -40,7 +40,7 @@ def test_the_budget_shows_each_seed_and_the_mean_of_each_method():
     scores, times = draw_budget(rows).axes
     methods = list(dict.fromkeys(rows["method"]))
     assert {text.get_text() for text in scores.get_yticklabels()} == set(map(method_words, methods))
-    means = [line.get_xdata()[0] for line in scores.lines if line.get_marker() == "o"]
+    means = [float(np.ravel(line.get_xdata())[0]) for line in scores.lines if line.get_marker() == "o"]
     assert len(means) == len(methods) and means == sorted(means)
     for axes in (scores, times):
         dots = [line for line in axes.lines if line.get_marker() == "."]
