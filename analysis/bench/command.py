@@ -70,9 +70,7 @@ def require(options: BenchOptions) -> None:
 def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
     """Scenes on the meter's device."""
     say(_about(meter.device), console=console)
-    workloads = []
-    if options.subject is not None:
-        workloads = [workload_of(Path(options.subject))]
+    workloads = [] if options.subject is None else [workload_of(Path(options.subject))]
     sizes = [Size.parse(text) for text in options.sizes or (() if workloads else SIZES)]
     options.out.mkdir(parents=True, exist_ok=True)
     times, bounds = [], []
