@@ -10,7 +10,8 @@ returns a frozen result that carries its error.  Bad arguments, and products tha
     checks        `check_operator`: is it symmetric, are its products finite?
     estimators    `estimate_traces`, `estimate_diagonal`, `extreme_eigenpairs`, `spectral_density`
     indices       `anisotropy` of ends and a density; `block_anisotropies`: of the whole operator and of each of its blocks
-    slices        `evaluate_slice` along `random_directions`, `gradient_direction`, ...; `finite_probe` at finite steps
+    slices        `evaluate_slice` along `random_directions`, `gradient_direction`, ...; at finite
+                  steps `finite_probe` and `critical_sharpness`
     processes     `Ranks`, `DistributedOperator`
 """
 

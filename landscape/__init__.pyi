@@ -29,6 +29,7 @@ from .operators.renderer.renderer import RendererHessian as RendererHessian
 from .results import Bracket as Bracket
 from .results import Progress as Progress
 from .results import StopReason as StopReason
+from .slices.critical_sharpness import critical_sharpness as critical_sharpness
 from .slices.directions import gradient_direction as gradient_direction
 from .slices.directions import groups_of as groups_of
 from .slices.directions import line_between as line_between

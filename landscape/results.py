@@ -11,12 +11,13 @@ Every estimator returns a frozen dataclass: each number with its error, and the 
 `record()` of a result gives its scalars as plain Python values for JSON, with None for what is infinite or undefined.
 """
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from math import erf, isfinite, sqrt
+from math import erf, isfinite, nan, sqrt
 from pathlib import Path
 from textwrap import fill
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from jaxtyping import Float64
 from scipy.special import stdtrit
@@ -115,6 +116,19 @@ def sampling_error(terms: Float64[Tensor, " m"], population: int) -> Number:
         return None
     student = t_quantile(m - 1, erf(sqrt(2))) / 2
     return student * float(standard_deviation(terms)) * sqrt(1 / m - 1 / population)
+
+
+class Measured(NamedTuple):
+    """A number and its error: of `mean`, over draws (`sampling_error`), nan where a single one was drawn."""
+
+    value: float
+    error: float
+
+    @classmethod
+    def mean(cls, terms: Float64[Tensor, " m"]) -> "Measured":
+        """The mean of independent draws."""
+        error = sampling_error(terms, sys.maxsize)
+        return cls(float(terms.mean()), nan if error is None else error)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from analysis.measures.memory import expected_peak, size_of
 from analysis.measures.units import optimiser_units, step_lengths
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
-from analysis.probe.plan import compiles, expected_seconds, seconds_of_render
+from analysis.probe.plan import MEASURES, compiles, expected_seconds, seconds_of_render
 from analysis.probe.record import probe_arrays, probe_record
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.views import write_views
@@ -86,10 +86,14 @@ def _run(
         subject = open_subject(options.checkpoint, options.foreign, out)
         checkpoint, scene = subject.checkpoint, subject.scene
         checkpoint.training.move(device)
-        objective = subject.objective(loss=LossSettings() if options.loss == "3dgs" else None)
+        loss = LossSettings() if options.loss == "3dgs" else None
+        objective = subject.objective(loss=loss)
     guessed = guess(checkpoint.origin)
     say(*guessed, _introduction(scene, checkpoint, objective), console=console)
-    say(_expected(objective, settings, 0.0 if families is None else families.products), console=console)
+    say(
+        _expected(objective, settings, (families.products if families else 0.0) + MEASURES * options.measures),
+        console=console,
+    )
     made = asked(options, checkpoint)
     identity = f"{made.but('settings.per_attribute').digest} {device}"  # families are measured after what is kept
     # the folder is opened first, so that one that cannot be written is refused before anything is measured
@@ -111,6 +115,11 @@ def _run(
             measured = measure_per_attribute(objective, checkpoint.training, families, stream, stages.stage, found.ends)
             data, arrays["per_attribute"] = measured.added_to(data), measured.arrays()
         data.notes += checkpoint.assumptions
+        if options.measures and folder is not None:
+            from analysis.probe.measures import measures  # slow to import
+
+            with stages.stage("measures") as report:
+                data.measures = measures(subject, loss, options.seed, report)
         if folder is not None:
             objective.release()  # for the memory of the processes that draw
             ends = data.eigenvalues.max, data.eigenvalues.min

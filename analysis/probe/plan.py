@@ -12,6 +12,7 @@ from splat.curvature.objective import SceneObjective
 
 MOST_AT_ONCE = 4  # start vectors of Lanczos runs that advance together
 TIMED = 3  # renders; the median counts
+MEASURES = 33.0  # products with MOST_AT_ONCE vectors that --measures takes as long as
 PRODUCT, BEFORE = 4.5, 50  # in renders: a product with MOST_AT_ONCE vectors; all that comes before the first stage
 PICTURES, QUICK_PICTURES = 3.0, 0.5  # seconds to draw them, which hardly depend on the scene
 POINTS = 320  # of a slice's plane that are usually rendered

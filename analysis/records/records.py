@@ -111,9 +111,10 @@ class ProbeRecord(Struct, kw_only=True):
 
     traces: by attribute (means, log_scales, quats, opacity_logits, sh).  finite_probe, depth, slice: None where left out.
     steps: length of the optimiser's first step in a parameter, by attribute.  step_rises: of the loss in such steps with random
-    signs, rendered, with its error (`analysis.measures.units`).  skipped: by the kind of work.  checks: symmetry,
-    round_off, finiteness, finite_difference.  timing: stage -> seconds, in the order run, and "total".  notes: sentences on
-    what was skipped, capped, or not reached.  arrays: group -> name -> shape.
+    signs, rendered, with its error (`analysis.measures.units`).  measures: those of `analysis.probe.measures`, each with its
+    error.  skipped: by the kind of work.  checks: symmetry, round_off, finiteness, finite_difference.  timing: stage ->
+    seconds, in the order run, and "total".  notes: sentences on what was skipped, capped, or not reached.  arrays: group ->
+    name -> shape.
     """
 
     COMMAND: ClassVar[str] = "probe"
@@ -131,6 +132,7 @@ class ProbeRecord(Struct, kw_only=True):
     block_shares: Maybe[list[schema.BlockShare]] = UNSET
     steps: Maybe[dict[str, float]] = UNSET
     step_rises: Maybe[dict[str, tuple[float, float]]] = UNSET
+    measures: Maybe[dict[str, tuple[schema.Number, schema.Number]]] = UNSET
     slice: schema.Slice | None = None
     counts: Counts
     checks: dict[str, Check]

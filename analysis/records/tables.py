@@ -37,6 +37,13 @@ OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
 LEAST = 0.005  # share of an attribute in an eigenvector that is told
 WIDTH = 15  # of a column of the families' table, with which it fits into 80
+MEASURES = {
+    "order_fragility": "mean change of a colour when depths change by 1% at random, which only the order of Gaussians sees",
+    "field_sharpness": "rise of the loss, at new poses change of a colour, by a random field over the Gaussians",
+    "critical_sharpness": "2 / η; η: of the optimiser's next step, at which the loss is again what it is now",
+    "open_curvature": "mean variance of a pixel of new poses that the training views leave open",
+    "open_ratio": "the same over that at the training poses",
+}
 NARROW = 0.1  # width of a bracket, over the value, below which it is written as an error
 Row = tuple[str, str, str]
 
@@ -49,6 +56,7 @@ def number_rows(data: ProbeRecord) -> dict[str, list[Row]]:
         "Anisotropy": _index_rows(data),
         "Finite steps along e₁": _finite_rows(data.finite_probe),
         "Positions along and across the rays": _depth_rows(data.depth),
+        "Beyond derivatives at the training views": _measure_rows(data.measures or {}),
         "Shares within blocks": _share_rows(data.block_shares or []),
         "Sizes": _count_rows(data.counts),
         "Checks": _check_rows(data.checks),
@@ -143,6 +151,21 @@ def _depth_rows(depth: Depth | None) -> Iterator[Row]:
         )
         rises += f"{row.depth_crossed:.0%} and {row.lateral_crossed:.0%} of the renders"
         yield f"depth / lateral rise, {row.pixels:g} px", measured(row.ratio, row.ratio_error), rises
+
+
+def columns_of(found: Mapping[str, tuple[Number, Number]]) -> dict[str, Number]:
+    """A row of a table: each number by its name, and its error, where it has one, behind it as name_error."""
+    row: dict[str, Number] = {}
+    for name, (value, error) in found.items():
+        row |= {name: value} | ({} if error is None else {f"{name}_error": error})
+    return row
+
+
+def _measure_rows(found: Mapping[str, tuple[Number, Number]]) -> Iterator[Row]:
+    for name, number in found.items():
+        kind = name.removesuffix("_new")
+        about = MEASURES[kind] + (", at new poses" if name != kind else "")
+        yield kind.replace("_", " "), quantity(number[0]) if name == "open_ratio" else measured(*number), about
 
 
 def _share_rows(shares: Iterable[BlockShare]) -> Iterator[Row]:

@@ -1,9 +1,9 @@
 """A row of the study's table: one checkpoint, measured.  Of every training: at its end, and at each of LEVELS that it reached.
 
 All curvature is in the optimiser's units, of D H D with the learning rates of the first step: traces of SAMPLES samples, both
-ends to 1% or ENDS products, the participation ratio by a density of DENSITY products.  New poses are the cameras of the views
-that were held out, POSES of them spread evenly; their photographs are in psnr_test alone.  A number with draws has _error
-beside it (`notebooks.prediction.poses.Measured`); of lambda it is the residual, of the participation ratio _low and _high.
+ends to 1% or ENDS products, the participation ratio by a density of DENSITY products.  What is not curvature
+is of `analysis.probe.measures`; photographs of the views that were held out are in psnr_test alone.  A number with draws has
+_error beside it (`landscape.results.Measured`); of lambda it is the residual, of the participation ratio _low and _high.
 """
 
 from dataclasses import asdict
@@ -12,23 +12,21 @@ from typing import Any
 
 import torch
 
-from analysis.measures.units import optimiser_units, scene_size
+from analysis.measures.units import optimiser_units
+from analysis.probe.measures import measures, new_poses
+from analysis.records.tables import columns_of
 from landscape import EigenSettings, extreme_eigenpairs, spectral_density
 from landscape.operators.operator import LiftedOperator, ScaledOperator
+from landscape.results import Measured
 from landscape.spectrum.anisotropy import anisotropy
 from landscape.spectrum.density import ActiveSpace
 from landscape.traces.trace import total_trace
-from notebooks.prediction.fields import field_sharpness
-from notebooks.prediction.measures import coadaptation, critical_sharpness, ensemble, open_curvature, order_fragility
-from notebooks.prediction.poses import Measured, Poses
+from notebooks.prediction.measures import coadaptation, ensemble
 from splat import open_subject
-from splat.backend.cpu.adam import BETA1
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
-from splat.scenes.splits import spread_views
-from splat.training.adam import Adam
 from splat.training.checkpoint import load_checkpoint
 from splat.training.origin.fingerprint import digest
 from splat.training.origin.subject import Subject
@@ -36,8 +34,6 @@ from splat.training.score.evaluate import evaluate
 from splat.training.state import Training
 
 SAMPLES, ENDS, DENSITY = 8, 150, 64
-POSES = 4
-LENGTH = 0.01  # correlation of the fields, of the scene's size
 Row = dict[str, Any]
 
 
@@ -49,18 +45,10 @@ def measured_row(path: Path) -> Row:
     background, config = training.config.background_colour(training.gaussians.flat.dtype), training.config
     psnr = {f"psnr_{part}": evaluate(training.gaussians, some, background, config.render).psnr
             for part, some in views.items()}  # fmt: skip
-    objective, new = subject.objective(), new_poses(subject)
-    seen = Poses([view.camera for view in views["train"]], background, config.render)
     gaussians, row = training.gaussians, Row(psnr)
-    row |= {"step": training.step, "gaussians": len(gaussians)} | curvature(objective, training)
-    row |= columns("order_fragility", order_fragility(gaussians, seen, seeded()))
-    row |= columns("order_fragility_new", order_fragility(gaussians, new, seeded()))
-    field = field_sharpness(gaussians, objective, new, LENGTH * scene_size(objective), seeded())
-    row |= columns("field_sharpness", field.loss) | columns("field_sharpness_new", field.images)
-    row |= columns("critical_sharpness", along_the_update(objective, training))
-    opened, ratio = open_curvature(gaussians, seen, new)
-    row |= columns("open_curvature", opened) | {"open_ratio": ratio}
-    row |= columns("coadaptation", coadaptation(gaussians, new, seeded()))
+    row |= {"step": training.step, "gaussians": len(gaussians)} | curvature(subject.objective(), training)
+    row |= columns_of(measures(subject))
+    row |= columns("coadaptation", coadaptation(gaussians, new_poses(subject), seeded()))
     return row | {"digest": subject.checkpoint.state, "scene_digest": scene_digest(subject)}
 
 
@@ -86,13 +74,6 @@ def columns(name: str, found: Measured) -> Row:
     return {name: found.value, f"{name}_error": found.error}
 
 
-def new_poses(subject: Subject) -> Poses:
-    config, flat = subject.checkpoint.training.config, subject.checkpoint.training.gaussians.flat
-    held_out = subject.scene.select(subject.checkpoint.scene.test)
-    cameras = [frame.camera for frame in subject.scene.select(spread_views(held_out, POSES))]
-    return Poses(cameras, config.background_colour(flat.dtype), config.render)
-
-
 def curvature(objective: SceneObjective, training: Training) -> Row:
     """Traces, ends and participation ratio of D H D."""
     D, hessian = optimiser_units(objective, training.config.rates, training.extent), SceneHessian(objective)
@@ -111,21 +92,3 @@ def curvature(objective: SceneObjective, training: Training) -> Row:
     assert spread is not None  # there is a density
     row |= {"eigenvalue_ratio": found.eigenvalue_ratio.value, "participation_ratio": spread.value}
     return row | {"participation_ratio_low": spread.low, "participation_ratio_high": spread.high}
-
-
-def along_the_update(objective: SceneObjective, training: Training) -> Measured:
-    """Critical sharpness along Adam's next update, with the gradient of all training views for its first moment too.
-
-    Along a momentum of single views the loss need not fall, and the sharpness is then undefined.
-    """
-    active = training.gaussians.select(objective.mask)  # as stored, quaternions too: the moments are of these
-    at, count, gradient = objective.linearizer(active), len(objective.views), torch.zeros_like(active.flat)
-    for index in range(count):
-        gradient += at(index).gradient / count
-    rates = training.gaussians.with_flat(training.rates(training.step)).select(objective.mask).flat
-    second, updates = training.adam.second.select(objective.mask), training.adam.updates
-    first = active.with_flat(gradient * (1 - BETA1**updates))  # of so many equal gradients
-    after = active.flat.clone()
-    Adam(first, second, updates).update(after, gradient, rates)
-    step = active.flat - after
-    return critical_sharpness(objective.loss, active.flat, step, float(gradient.double() @ step.double()))

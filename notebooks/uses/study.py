@@ -27,13 +27,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 
-from analysis.commands.uses.next_view import informations, picked
+from analysis.commands.uses.next_view import picked
 from analysis.console.plain import say
 from analysis.records.json_files import json_text, read_json
 from analysis.records.schema import Count
 from figures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, literal, new_figure, save, style
 from landscape.errors import InputError
-from splat.curvature.scores.information import GAINS
+from splat.curvature.scores.information import GAINS, informations
 from splat.model.untrusted import read_toml, require_name, write_atomically
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import split_scene

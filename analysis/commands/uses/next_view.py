@@ -19,9 +19,7 @@ from pathlib import Path
 
 import pandas as pd
 import torch
-from jaxtyping import Float
 from rich.console import Console
-from torch import Tensor
 
 from analysis.bench.tables import rich_table
 from analysis.commands.uses.options import GEOMETRY, TWICE, NextViewOptions
@@ -33,11 +31,7 @@ from analysis.records.provenance import provenance_of
 from analysis.records.quantities import quantity
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError, did_you_mean
-from landscape.results import Progress
-from splat.curvature.scores.information import GAINS, Information, gains, gains_of_each, information, prior_of
-from splat.model.camera import Camera
-from splat.model.gaussians import Gaussians
-from splat.model.settings import RenderSettings
+from splat.curvature.scores.information import GAINS, Information, gains, gains_of_each, informations, prior_of
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import open_subject
 from splat.training.origin.scene_reference import data_of
@@ -92,22 +86,6 @@ def _candidates(names: Sequence[str], checkpoint: Checkpoint, scene: Scene) -> l
     found = [frame.name for frame in scene.frames if frame.name not in used]
     if not found:
         raise InputError("expected views that are neither trained on nor held out, got none; name some by --candidates")
-    return found
-
-
-def informations(
-    gaussians: Gaussians,
-    cameras: Mapping[str, Camera],
-    background: Float[Tensor, "3"],
-    settings: RenderSettings,
-    report: Progress | None = None,
-) -> dict[str, Information]:
-    """Information of each camera about the Gaussians."""
-    gaussians, found = gaussians.aligned_to(gaussians), {}
-    for name, camera in cameras.items():
-        found[name] = information(gaussians, camera, background, settings)
-        if report:
-            report(len(found), len(cameras), "views")
     return found
 
 

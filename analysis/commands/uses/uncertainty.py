@@ -19,7 +19,6 @@ import torch
 from jaxtyping import Float
 from rich.console import Console
 
-from analysis.commands.uses.next_view import informations
 from analysis.commands.uses.options import UncertaintyOptions
 from analysis.console.drawing import draw
 from analysis.console.plain import say
@@ -30,7 +29,7 @@ from analysis.records.quantities import quantity
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError
 from splat.curvature.linearize import LinearizedView
-from splat.curvature.scores.information import Information, prior_of
+from splat.curvature.scores.information import Information, informations, prior_of
 from splat.curvature.scores.uncertainty import pixel_variance
 from splat.losses.reference import LossSettings
 from splat.render.backend import CPU

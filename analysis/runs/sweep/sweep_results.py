@@ -26,6 +26,7 @@ from analysis.records.quantities import PLACES, PLUS_MINUS, SCORES, quantity
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import ViewScores, read_scores
 from analysis.records.schema import INDICES, Index
+from analysis.records.tables import columns_of
 from analysis.runs.sweep.sweep_file import Cell, Sweep
 from splat.training.checkpoint import write_atomically
 
@@ -118,6 +119,7 @@ def probe_of(run: Path) -> dict[str, float | str | None]:
     row |= {name: ends[end].reason or "" for name, end in REASONS.items()}
     for name, index in data.anisotropy.items():
         row |= {name: _bounded(index), f"{name}_low": index.low, f"{name}_high": index.high}
+    row |= columns_of(data.measures or {})
     effects = data.split_control.effects if data.split_control else ()
     whole = [effect for effect in effects if (effect.operator, effect.block) == ("hessian", "all")]
     return row | {f"{SPLIT}{effect.index}": _bounded(effect) for effect in whole}

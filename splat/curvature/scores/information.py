@@ -17,12 +17,14 @@ Prior: precisions that are PRIOR times the mean of the training views' diagonals
 is known without any view, and decides what a Gaussian that none has seen yet is worth.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.results import Progress
 from splat.curvature.fields import eigenvalues, on_complement
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import LinearizedView
@@ -74,6 +76,22 @@ def information(
     grey = _squares(channel_sum(gaussians), camera, _red(background.sum()), settings)
     own, sh = grey.geometry.double().diagonal(dim1=1, dim2=2)[:, UNTURNED], blocks.sh.double()
     return Information(geometry, sh, torch.cat([own.clamp_min(0), sh.flatten(1)], dim=1))
+
+
+def informations(
+    gaussians: Gaussians,
+    cameras: Mapping[str, Camera],
+    background: Float[Tensor, "3"],
+    settings: RenderSettings,
+    report: Progress | None = None,
+) -> dict[str, Information]:
+    """Information of each camera about the Gaussians."""
+    gaussians, found = gaussians.aligned_to(gaussians), {}
+    for name, camera in cameras.items():
+        found[name] = information(gaussians, camera, background, settings)
+        if report:
+            report(len(found), len(cameras), "views")
+    return found
 
 
 def prior_of(seen: Information) -> Information:

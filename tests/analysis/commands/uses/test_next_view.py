@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from analysis.commands.cli import main
-from analysis.commands.uses.next_view import gains_over, informations, picked
+from analysis.commands.uses.next_view import gains_over, picked
+from splat.curvature.scores.information import informations
 from splat.model.files.splat_ply import splat_ply
 from splat.model.settings import RenderSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene

@@ -1,37 +1,20 @@
-"""What the measures share: images of Gaussians at poses that need no photograph, and a mean with its error.
+"""What measures at poses share: images of Gaussians where no photograph is needed.
 
 new poses   the cameras of the views that were held out, without their photographs
 |A - B|_1   the mean of |A - B| over pixels and colours, of images whose colours are in [0, 1]
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import nan
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.results import sampling_error
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.render.render import render
-
-
-class Measured(NamedTuple):
-    """A number and its error: of `mean`, over draws (`sampling_error`), nan where a single one was drawn."""
-
-    value: float
-    error: float
-
-    @classmethod
-    def mean(cls, terms: Float64[Tensor, " m"]) -> "Measured":
-        """The mean of independent draws."""
-        error = sampling_error(terms, sys.maxsize)
-        return cls(float(terms.mean()), nan if error is None else error)
 
 
 @dataclass(frozen=True, eq=False)

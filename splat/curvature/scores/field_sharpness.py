@@ -25,8 +25,9 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from notebooks.prediction.poses import Measured, Poses, distance
+from landscape.results import Measured
 from splat.curvature.objective import SceneObjective
+from splat.curvature.scores.poses import Poses, distance
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
