@@ -113,15 +113,14 @@ def draw_fragility(maps: dict[str, np.ndarray], index: int, record: MapRecord) -
     view = next((Path(panel.name).name for panel in record.panels if panel.place == index), "")
     titles = {
         "order_gap": "Position: how far to the next change of order",
-        "condition": f"Conditioning: {percent(fragile.needles)} are needles, longer than 10 : 1",
-        "one_view": f"Opacity: {percent(fragile.one_view)} have over 90% of their weight in one view",
+        "condition": f"Conditioning: {percent(fragile.needles)} of all are needles, longer than 10 : 1",
+        "one_view": f"Opacity: {percent(fragile.one_view)} of all have over 90% of their weight in one view",
     }
     with style():
         figure, places = _sheet(2, 2, maps["error"].shape, 2)
-        figure.suptitle(literal(f"{view}: where it is fragile"))
+        figure.suptitle(literal(f"{view}: where it is fragile; shares are of all Gaussians in sight"))
         for axes, (name, title) in zip(places.flat, titles.items(), strict=False):
-            label = shades[name].title + ("" if name == "one_view" else "; bright: fragile")
-            show_scaled(axes, maps[name], shades[name], title, label)
+            show_scaled(axes, maps[name], shades[name], title, f"{shades[name].title}; bright: fragile")
         _draw_swaps(places[1, 1], fragile.swaps, index)
     return figure
 
