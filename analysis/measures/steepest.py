@@ -14,9 +14,9 @@ renders    of the part of the view around the carriers, all Gaussians moved by -
 
 Why renders can refute a small negative end.  On fern (2,000 steps) lambda_min is -0.074, but second differences of rendered
 losses over 1/4 to 4 steps of the optimiser are +0.20 to +0.22.  Kinks of L1 make 0.11 to 0.17 of the gap (0.15 by the formula),
-changes of order below 0.0002, and splats that cross alpha_min, with higher orders, the other 0.10 to 0.18.  Without alpha_min
-and with signs held still it is -0.027 to -0.011.  A steep end gains by the same: on DTU's scan 24 (1,500 steps) 48 becomes 61
-over the optimiser's step, where kinks make 13 by the formula.
+reordered splats below 0.0002, and splats that cross alpha_min, with higher orders, the other 0.10 to 0.18.  Without alpha_min
+and with signs held still these differences are -0.027 to -0.011.  A steep end gains by the same: on DTU's scan 24 (1,500
+steps) 48 becomes 61 over the optimiser's step, where kinks make 13 by the formula.
 """
 
 from collections.abc import Sequence
@@ -49,10 +49,10 @@ from splat.scenes.write import bytes_of
 NEAR = 0.01  # |residual|, of a range of 1, below which residuals are taken to be spread evenly
 LEAST, MOST = 0.05, 5  # smallest share of the mass of a carrier; most carriers
 RISE = 0.01  # relative change of the loss at the longest step, by the curvature
-STEPS = 7  # each half of the one before; the shortest changes the loss by 2e-6, above round-off
+STEPS = 7  # each half of the one before; the shortest: 2e-6 of the loss, above round-off
 SIGMAS = 2.0  # standard deviations at which an outline is drawn
 TINY = torch.finfo(torch.float32).tiny
-ROOM, SMALLEST = 1.3, 8  # size of a crop: in outlines; at least 1 / SMALLEST of its view
+ROOM, SMALLEST = 1.3, 8  # size of a crop: times the outlines; at least 1 / SMALLEST of its view
 VERBS = {"means": "moves", "log_scales": "stretches", "quats": "turns", "opacity_logits": "fades", "sh": "recolours"}
 PLACES = (
     ("in the upper left", "at the top", "in the upper right"),
@@ -135,7 +135,7 @@ def heaviest(
 
 
 def weights_of(objective: SceneObjective) -> Float[Tensor, "m n"]:
-    """The sum of alpha T over the pixels of each view: what one channel of the image's sum changes by with a splat's colour."""
+    """The sum of alpha T over the pixels of each view: the derivative of a channel's sum in a splat's colour."""
     found = []
     for view in objective.views:
         splats = project_by_kernel(objective.active, view.camera, objective.settings)
@@ -217,7 +217,9 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
     low, high = quantity(min(factors)), quantity(max(factors))
     beyond = sum(not 1 / WITHIN <= factor <= WITHIN for factor in factors)
     verdict = (
-        f"outside of 1/2 to 2 at {beyond} of {len(factors)}, where they refute it" if beyond else "all within 1/2 to 2"
+        f"outside of 1/{WITHIN:g} to {WITHIN:g} at {beyond} of {len(factors)}, where they refute it"
+        if beyond
+        else f"all within 1/{WITHIN:g} to {WITHIN:g}"
     )
     return f"{text}; over {extent} by {low} to {high} times what the curvature has, {verdict}."
 

@@ -6,7 +6,7 @@ the whole space, or when matvecs or seconds are spent.  Where the basis spans an
 the wanted values unchanged.
 
 Davidson's method, preconditioned by diagonal blocks, would take fewer products.  But it can miss an extreme eigenvalue that
-only the entries outside these blocks make, and converge to its neighbour; a Lanczos recurrence finds such ends, too.
+only the entries outside these blocks make, and converge to its neighbour; a Lanczos recurrence is not blind to them.
 """
 
 from time import monotonic

@@ -1,7 +1,7 @@
 """Choice of the points at which a slice is evaluated: both axes, then points that fill the plane until they predict the others.
 
     axes        every point: nothing is interpolated along a line, nor along the two sections of a plane
-    fill        the points farthest from all that are known: COARSE at first, then 3/4 as many as are known beside the axes
+    fill        the points farthest from all that are known: COARSE at first, then 3/4 as many as are known off the axes
     hold out    predict all points that are not known, then evaluate max(holdout, number filled) of them, at random: the more
                 they are, the closer the bound is to the largest error.  If the bound is within tolerance * range, the slice is
                 done, with these predictions; else fill again, and the interpolant has the points held out, too
@@ -10,7 +10,7 @@ bound: `interpolation.error_bound`, of the error at every point not known, from 
 hold-out may err with a chance of 5% / 2^k.  range: largest less smallest of the values evaluated.
 
 A slice keeps the interpolant that was judged.  Fitting it again with the points held out made it worse in 95% of the draws on
-a fern's planes: some lie next to an axis, where the spline of (f - axes) / (x y) magnifies jumps.  A plane whose bound is not
+a fern's planes: some lie next to an axis, where its spline, divided by x y, magnifies jumps.  A plane whose bound is not
 within the tolerance at max_evaluations is not resolved: its points are those that were evaluated.  Decisions are made when
 a whole hold-out is evaluated, so that the result does not depend on the number of workers.
 """
@@ -38,7 +38,7 @@ class SliceSettings:
         tolerance, at most 5.6% of the other points are not, with 97.5% confidence at the first hold-out; `error_bound`
         extrapolates to all.
     workers: threads that evaluate.
-    max_evaluations: budget, which counts the axes and the centre, always evaluated, and points kept from an earlier run.
+    max_evaluations: budget; counts the axes and once more the centre, both always evaluated, and points of an earlier run.
         Allowed only with a tolerance.
     """
 

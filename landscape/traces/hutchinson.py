@@ -3,7 +3,7 @@
 An adaptive run stops when half the width of its interval is at most max(rtol |trace|, atol).  Every look at the interval may
 find it too short by chance.  So a run that misses its tolerance looks again only after GROWTH times as many probes; one that
 meets it looks again CONFIRMATION probes later and stops if it still does (Simons 1968).  For the chance that is left its
-interval is wider by WIDENING.
+interval is WIDENING times as wide.
 
 A block is some of the rows; a group is GROUP probes whose vectors are kept together, for the z_i^T H z_j of every two of them,
 which tell the variance (`quadratic`).
@@ -42,11 +42,11 @@ class TraceSettings:
 
     distribution: entries of a probe are random signs ("rademacher") or standard normal ("gaussian").
     reading, method: see `landscape.traces.trace`.
-    rtol, atol: a block is done when half the width of its interval is at most max(rtol |trace|, atol).  With both 0 every
+    rtol, atol: a run is done when half the width of every interval is at most max(rtol |trace|, atol).  With both 0 every
         block takes max_probes, unless max_seconds end it.  confidence: of the interval.
     min_probes: probes before the first look at the error.  max_probes: largest number of matvecs of a block by any method.
     max_seconds: for all blocks together; each takes min_probes even beyond it.  batch: vectors the operator takes at once.
-    memory: GiB for the vectors that a sketch keeps; XTrace stops when they are full.
+    memory: GiB for the vectors that a sketch keeps; XTrace stops when it is full.
     """
 
     distribution: Distribution = "rademacher"
@@ -131,7 +131,7 @@ class Hutchinson:
     """Hutchinson's estimator on one operator, for several blocks at once.
 
     rows: of the blocks, by name.  samples: (blocks, probes), the sum of z_r (H z)_r over a block's rows r.  known: part of the
-    trace that the operator lacks, of a single block; else 0.  spent: matvecs of this part.  keep: most probes that stay, with
+    trace that the operator lacks, of a single block; else 0.  spent: matvecs for `known`.  keep: most probes that stay, with
     their products, in `kept`, which is emptied when there are more.
     """
 

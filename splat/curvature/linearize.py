@@ -13,7 +13,7 @@ Regularisers are added to value, gradient and H u; they have no part in G u.
 P' and a . P'' of the Gaussians that reach a tile before its pixels stop, tile lists, final transmittances, g and a are
 computed once.  H U is then two passes over the pixels for K vectors together, the columns of U (p, K), laid out like
 `Gaussians.flat`; G U takes one for all vectors, and one more for each.
-What is piecewise constant counts as constant: the order of the splats, the alpha_min cut, where a pixel stops, and the clamps.
+Constant is what is so piecewise: the order of the splats, the alpha_min cut, where a pixel stops, which clamps hold.
 
 Shapes: p parameters, n splats, k vectors (K above), 9 numbers of a splat (place, inverse covariance, opacity, colour), h x w
 pixels of the image, H x W of whole tiles, 4 planes: red, green, blue, accumulated alpha.
@@ -134,7 +134,7 @@ class LinearizedView:
         return self._raster.workspace(vectors) + self._loss.workspace(vectors)
 
     def affects(self, U: Float[Tensor, "p k"]) -> bool:
-        """Whether products can be other than 0: some vector changes a Gaussian that the view draws.
+        """Whether products can be other than 0: some vector changes a Gaussian that is drawn or regularised.
 
         Always True on a GPU, where the test would synchronise with the device.
         """

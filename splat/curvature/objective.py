@@ -4,8 +4,8 @@
 
 theta: the parameters of the active Gaussians, laid out like `Gaussians.flat`; I_m: the render of view m, of M; l: the loss
 against its picture; R: regularisers of opacities and scales, where there are any (`losses/regularizers.py`).  Parameters that
-no l can depend on are removed and counted: Gaussians that touch no pixel of any view, and SH bands not in use; their share of
-R is a constant.  Quaternions are normalised: this changes no image, and makes the trace of their block of the Hessian, which
+no l depends on nearby are removed and counted: Gaussians that touch no pixel of any view, and SH bands not in use; their share
+of R is a constant.  Quaternions are normalised: this changes no image, and makes the trace of their block of the Hessian, which
 scales with 1/|q|^2, well defined.
 """
 

@@ -2,7 +2,7 @@
 
     L(theta) = 1/M sum_m l(I_m(theta))       I_m: image of view m, differentiable once; l: its loss, twice by torch
     g = l'(I),   J = dI/dtheta,   w = l'' J v
-    H v = J^T w + d/dh J(theta + h v)^T g    the first term is Gauss-Newton, G v; in the second g stands still
+    H_m v = J^T w + d/dh J(theta + h v)^T g  at h = 0; the first term is Gauss-Newton, G v; in the second g stands still
 
 **Differences.**  With I+ and J+ at theta + h v, I- and J- at theta - h v, each derivative has two one-sided estimates:
 
@@ -43,7 +43,7 @@ TRIALS = 2  # renders that find a step
 FACTOR = 1e4  # the largest by which a trial changes h
 ROUNDING = 1 / 4  # mean error of a rounded number, in units of eps
 KEPT = 1 << 30  # bytes for J^T g of the first views; each other view costs one backward pass more in a product
-SEEN = 3  # times the noise: a smaller change of an image may be noise alone, by which two renders differ by sqrt(2)
+SEEN = 3  # times the noise: a smaller change of an image may be noise: two renders differ by sqrt(2) of it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,7 +52,7 @@ class ProductErrors(ShortRepr):
 
     step: length of the difference to the product at twice the step.  An error in proportion to h or a higher power changes by
     at least its own size when h doubles; those of rounding and jumps differ at random.
-    noise: length of the difference of two equal products, over sqrt(2); 0 for a renderer that repeats itself.
+    noise: length of the difference to the same product repeated, over sqrt(2); 0 for a renderer that repeats itself.
     kinks: no length, but the share of |J v|^2 in pixels whose one-sided differences disagree.
 
     J^T, from the renderer's own backward pass, is taken as exact: `check_renderer` compares it with J.
@@ -64,7 +64,7 @@ class ProductErrors(ShortRepr):
 
     @property
     def total(self) -> Float64[Tensor, " k"]:
-        """2 sqrt(step^2 + noise^2): twice the error that two products show.  On splats it holds 9 of 10 errors or more."""
+        """2 sqrt(step^2 + noise^2): twice the error that two products show.  On splats it covers 9 in 10 errors or more."""
         return 2 * torch.hypot(self.step, self.noise)
 
 
@@ -111,17 +111,17 @@ class RendererHessian:
     parameters: the leaf tensors by name, of one type on one device; each is a block, in this order; neighbours whose names
         agree before a slash, as sh/dc and sh/rest, are one.
     loss: from (image, view) to a tensor of one number, by torch operations that are differentiable twice in the image.
-    views: one graph at a time is kept, whatever their number.
+    views: two graphs at most are held, whatever their number.
     noise: standard deviation of the renderer's noise, relative to the image's root mean square; raised to what two renders of
         the first view show.
 
     value, gradient: of the mean loss.  gauss_newton: the operator J^T l'' J.  deterministic: whether the two renders are equal.
-    curved: whether products have the second term; point: the parameters at hand then; kept: J^T g of the first views.
+    curved: whether products have the second term; point: the parameters when it was made; kept: J^T g of the first views.
     Products move the parameters in place, and bring them back to the bit, after an exception too.  Approximations: see `error`.
 
     >>> x = torch.tensor([0.5, 2.0], dtype=torch.float64, requires_grad=True)
     >>> H = RendererHessian(lambda t: torch.exp(t * x), {"x": x}, lambda image, t: image.square().sum() / 2, [1.0, 1.0])
-    >>> H.apply(torch.eye(2, dtype=torch.float64)).diagonal() / (2 * torch.exp(2 * x.detach()))  # e^2x / 2, twice
+    >>> H.apply(torch.eye(2, dtype=torch.float64)).diagonal() / (2 * torch.exp(2 * x.detach()))  # (e^2x / 2)''
     tensor([1.0000, 1.0000], dtype=torch.float64)
     >>> H.passes(vectors=1), H.gauss_newton.passes(vectors=1)
     ((8, 6), (8, 2))
@@ -182,7 +182,7 @@ class RendererHessian:
         return self.products(V)[0]
 
     def error(self, V: Float[Tensor, "n k"]) -> ProductErrors:
-        """Errors of the products with these vectors, for two products with each, and a third where there is noise."""
+        """Errors of the products with these vectors; takes two products with each, and a third where there is noise."""
         return self.measured(V)[1]
 
     def measured(self, V: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n k"], ProductErrors]:
@@ -261,7 +261,7 @@ class RendererHessian:
             yield
 
     def step(self, index: int, view: LinearView, v: Tensor) -> float:
-        """The step h along v; 0 where it does not change the image, or by its noise alone."""
+        """The step h along v; 0 where the image changes by no more than its noise."""
         largest, size, seen = float(v.abs().max()), rms(view.image) or 1.0, False
         noise = SEEN * self.noise * size
         # at first the largest entry of h v is `change` times the largest parameter

@@ -13,7 +13,7 @@ b, p     where a row begins: in `state`, and in a plane of the picture
 T, STOP, IMAGE, REST, GRAD   in code, the vectors of a row in `state`, by number (a colour takes three): T lies at b + T * L;
          a row has FORWARD or BACKWARD of them
 T        in formulas, transmittance; `forward` keeps -T in front of the splat that stopped a pixel: its sign says "stopped"
-v_...    cotangent: the loss's derivative in what follows
+v_x      cotangent: the loss's derivative in x
 """
 
 import numpy as np
@@ -68,7 +68,7 @@ def forward(counter, params, lists, frame, pixels):
         first = np.int64(lists.start[tile])
         count = lists.start[tile + 1] - first
         some_stopped = False
-        # front to back; every 16 splats, if one has stopped since the last look: have all pixels?
+        # front to back; every 16 splats, if a pixel has stopped since the last look: have all?
         for k in range(count):
             prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
             some_stopped |= composite(params, lists, first + k, k, x0, y0, frame, state)
@@ -100,7 +100,7 @@ def composite(params, lists, e, k, x0, y0, frame, state):
             after = select(ends, -before, after)
             store(state, b + STOP * L, select(ends, k, load(state, b + STOP * L)))
             stopped = True
-        # image += w c, T -= w, with the splat's colour c
+        # image += w c, T -= w (or its sign turns), with the splat's colour c
         store(state, b + T * L, after)
         store3(state, b + IMAGE * L, L, plus(load3(state, b + IMAGE * L, L), w, colour))
     return stopped
@@ -180,7 +180,7 @@ def differentiate(params, lists, e, k, x0, y0, frame, state, sums):
         # alpha as in `forward`
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
         R, v_image = load(state, b + REST * L), load3(state, b + GRAD * L, L)
-        # T and R in front of the splat; s, the derivative in ln alpha, is 0 where alpha before the cap is above `free`
+        # T and R in front of the splat; s, the derivative in ln alpha, is 0 where alpha before the cap is above frame.free
         before, rest, w, beta, _r, we = step_back(alpha, load(state, b + T * L), R, v_image, colour)
         s = select(uncapped <= frame.free, we - beta * R, 0.0)  # we: w (v_image . c)
         store(state, b + T * L, before)

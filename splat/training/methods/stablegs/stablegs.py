@@ -41,8 +41,8 @@ Accuracy.  tr H_b has an exact part and a sampled one (`splat/curvature/traces.p
 MOST_SAMPLES (four where `accuracy` is inf), is such that the 95% interval of rho is within `accuracy`; rho goes like the
 inverse root of the trace.  A trace that almost cancels can miss the accuracy: its standard error is in the history.
 
-Left out because it has no effect: the traces of attributes that are not probed; the probed copy where there are no magnitudes;
-each loss of weight 0; viewpoints that see nothing; the edges without edge rotation.
+Left out because it has no effect: the traces of attributes that are not probed; each loss of weight 0; viewpoints that see
+nothing; the edges without edge rotation.
 """
 
 from collections.abc import Collection, Sequence
@@ -93,13 +93,13 @@ Ratio = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 
 @dataclass(frozen=True)
 class StableGS(MethodSettings):
-    """Settings of StableGS; by default the paper's.
+    """Settings of StableGS; where the defaults differ from the paper's, the module says so.
 
     warm_up: steps before probing starts; every: steps between two diagnoses (magnitudes and edges).
-    asp_weight, vsp_weight: of the probed copy's loss, and of the agreement from probed viewpoints; 0 leaves it out, both 0 make
-    it 3DGS.
+    asp_weight, vsp_weight: of the probed copy's loss, and of the agreement from probed viewpoints; 0 leaves it out, both 0
+    leave nothing of the probing.
     traces: "exact": only the coupling between pixels is sampled, and that in one of sampled_every diagnoses; "paper": Eq. (6),
-    ten normal samples a block, in every diagnosis.
+    ten Gaussian vectors a block, in every diagnosis.
     accuracy: of rho with "exact" traces, relative, with 95% confidence; inf takes the fewest samples, four.
     densify_after_warm_up: Gaussians are cloned, split and removed only after the warm-up.
     drop_share: p_max of DropGaussian, which leaves Gaussians out of the sampled view's render from the first step on; not the
@@ -129,7 +129,7 @@ class StableGS(MethodSettings):
         return StableGSMethod(self, seed)
 
     def parts(self, config: TrainConfig) -> dict[str, int]:
-        # without a probed attribute both losses compare the Gaussians with themselves
+        # without a probed attribute the copy is the original, and only a factor of the gradient changes
         return {"warm_up": self.warm_up} if self.probe.on and (self.asp_weight or self.vsp_weight) else {}
 
     def density_control(self, config: TrainConfig) -> DensifySettings:
@@ -194,7 +194,7 @@ class StableGSMethod(Method[StableGS]):
         probed = probe_attributes(
             step.gaussians, base.gradient, step.camera, base.splats, self.magnitudes, settings.probe, draws, sign
         )
-        in_base, in_probed = None, None  # gradients of both losses in Theta and in Theta'
+        in_base, in_probed = None, None  # gradients: of the agreement in Theta, of both losses in Theta'
         if settings.asp_weight:
             views = range(len(step.views)) if settings.asp_views == "all" else [step.chosen]
             for m in views:
@@ -247,7 +247,7 @@ class StableGSMethod(Method[StableGS]):
                 self.normals = [dominant_edge(depth, alpha)[0] for depth, alpha in depths]
 
     def traces(self, objective: SceneObjective, *, sampled: bool = True) -> dict[str, TraceEstimate]:
-        """Traces of the Hessian's blocks of the probed attributes.  sampled: the coupling of pixels anew."""
+        """Traces of the Hessian's blocks of the probed attributes.  sampled: whether the coupling of pixels is sampled anew."""
         settings, names = self.settings, self.settings.probe.on
         if not names:
             return {}
