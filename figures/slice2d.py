@@ -84,11 +84,11 @@ def finding(direction: Direction, change: np.ndarray, model: np.ndarray | None) 
     units = direction.steps[centre + steps] / direction.unit
     if held:
         rest = away if ratios[-1] < 0 else f"{extent(ratios[held:])} times as much"
-        return f"{along} curves as its curvature says to {rough(float(units[held - 1]))} units, then {rest}"
+        return f"{along} curves as its curvature says to {rough(float(units[held - 1]))} curvature units, then {rest}"
     if ratios.max() < 0:
         return f"{along} {away}, against its curvature"
     way = "" if ratios.min() < 0 else " up" if up else " down"
-    return f"{along} curves{way} {extent(ratios)} times what its curvature says, at {extent(units)} units"
+    return f"{along} curves{way} {extent(ratios)} times what its curvature says, at {extent(units)} curvature units"
 
 
 def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
@@ -160,9 +160,12 @@ def _legend(field: Plane) -> list[Line2D]:
         size = "unbounded" if field.error is None else f"<{rough(100 * field.error)}%"
         words = f"plane: {field.evaluated.mean():.0%} rendered,\nelse interpolated (error {size})"
         handles.append(Line2D([], [], label=words, **{**FAINT, "markersize": 4}))
-    if field.crossed is not None and any(_crossed(field, axis).any() for axis in (0, 1)):
+    if field.crossed is not None and field.crossed.any():
         words = f"order changed: {field.crossed.sum():,}\nof {field.evaluated.sum():,} renders"
-        handles.append(Line2D([], [], label=words, **{**CROSSED, "markersize": 6}))
+        marked = any(_crossed(field, axis).any() for axis in (0, 1))
+        handles.append(
+            Line2D([], [], label=words, **({**CROSSED, "markersize": 6} if marked else {"linestyle": "none"}))
+        )
     if field.model is not None:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
     handles.append(Line2D([], [], linestyle="none", label=f"1 curvature unit:\nΔL = {quantity(field.loss_scale)}"))

@@ -103,7 +103,6 @@ Shapes = dict[str, dict[str, list[Count]]]
 
 
 BOTH_ENDS = ("eigenvalue_ratio", "negative_ratio")
-DOUBTED = schema.Index(value=None, low=None, high=None, note="renders do not confirm λ max or λ min")
 
 
 class ProbeRecord(Struct, kw_only=True):
@@ -151,8 +150,11 @@ class ProbeRecord(Struct, kw_only=True):
     @property
     def indices(self) -> dict[str, schema.Index]:
         """The indices as they are said: a ratio of both ends has no number where renders do not confirm one of them."""
-        found = dict(self.anisotropy.items())
-        return found if self.eigenvalues.stand else found | {name: DOUBTED for name in BOTH_ENDS if name in found}
+        found, ends = dict(self.anisotropy.items()), {"λ max": self.eigenvalues.max, "λ min": self.eigenvalues.min}
+        if not (doubted := " or ".join(name for name, end in ends.items() if end.doubted)):
+            return found
+        without = schema.Index(value=None, low=None, high=None, note=f"renders do not confirm {doubted}")
+        return found | {name: without for name in BOTH_ENDS if name in found}
 
 
 class SliceRecord(Struct, kw_only=True):

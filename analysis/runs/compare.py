@@ -40,9 +40,10 @@ from splat.training.origin.subject import Checkpoint
 PAGE, TABLE = "compare.html", "compare.csv"
 ASKED = ("settings.", "seed", "objective.of")  # of the question: cautions have its other parts
 PICTURES = {
-    "compare_traces": "Traces by attribute, with their intervals. Filled: positive; open: negative; crossed: not decided.",
+    "compare_traces": "Traces by attribute; a line: the interval, where it is longer than the marker. Open markers: negative; "
+    "crosses: not decided.",
     "compare_densities": "How many directions are at least so curved, down (left) and up (right). Thin: each start "
-    "vector's quadrature alone: where these lie apart, its few steps do not decide. Dashed: the extreme eigenvalues.",
+    "vector's quadrature alone: where these lie apart, its few steps do not decide. Dotted: the extreme eigenvalues.",
     "compare_slices": "The plane of the two steepest directions of each run, in the window that all have, the same colours.",
     "compare_sections": "The loss along the two steepest directions of each run, in units of the parameters.",
 }

@@ -243,7 +243,7 @@ def _blue(figure):
 
 
 @pytest.mark.parametrize(("changed", "dots"), [(0.9, [18, 1]), (0.96, [0, 0])])
-def test_the_legend_tells_blue_dots_where_there_are_some_and_nearly_all_renders_have_none(tmp_path, changed, dots):
+def test_the_legend_tells_how_many_changed_also_where_nearly_all_have_and_no_dot_is_blue(tmp_path, changed, dots):
     data, arrays = synthetic()
     arrays["slice"]["crossed"] = np.zeros((21, 17), bool)
     arrays["slice"]["crossed"][: round(changed * 20), 8] = True
@@ -252,9 +252,10 @@ def test_the_legend_tells_blue_dots_where_there_are_some_and_nearly_all_renders_
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     assert _blue(figure) == dots
     entries = {
-        str(x.get_label()).split(":")[0]: x.get_color() for x in slice2d._legend(plane(read_record(tmp_path / "probe")))
+        str(x.get_label()).split(":")[0]: x.get_marker()
+        for x in slice2d._legend(plane(read_record(tmp_path / "probe")))
     }
-    assert entries.get("order changed") == (SKY if any(dots) else None)
+    assert entries["order changed"] == ("." if any(dots) else "None")  # their number is told in any case
 
 
 def test_contours_of_the_loss_are_solid_also_below_0_and_at_the_ticks_of_the_colour_bar(tmp_path):
@@ -286,14 +287,17 @@ def test_ranges_that_are_alike_have_the_same_ticks(tmp_path, stretch, same):
     ("ratio", "said"),
     [
         (lambda s: 1.1, "curves as its curvature says"),
-        (lambda s: 0.14, "curves up 0.14 times what its curvature says, at 0.30 to 3.0 units"),
-        (lambda s: 2.15 - 1.03 * s, "curves up 1.1 to 2.0 times what its curvature says, at 0.30 to 3.0 units"),
-        (lambda s: 1.1 - s, "curves as its curvature says to 0.90 units, then 0.10 to 0.70 times as much"),
+        (lambda s: 0.14, "curves up 0.14 times what its curvature says, at 0.30 to 3.0 curvature units"),
+        (
+            lambda s: 2.15 - 1.03 * s,
+            "curves up 1.1 to 2.0 times what its curvature says, at 0.30 to 3.0 curvature units",
+        ),
+        (lambda s: 1.1 - s, "curves as its curvature says to 0.90 curvature units, then 0.10 to 0.70 times as much"),
         (
             lambda s: 10 * (s - 0.5) ** 2 - 0.2,
-            "curves −0.20 to 2.3 times what its curvature says, at 0.30 to 3.0 units",
+            "curves −0.20 to 2.3 times what its curvature says, at 0.30 to 3.0 curvature units",
         ),
-        (lambda s: 1.3 - 1.5 * s, "curves as its curvature says to 0.90 units, then falls on one side"),
+        (lambda s: 1.3 - 1.5 * s, "curves as its curvature says to 0.90 curvature units, then falls on one side"),
         (lambda s: -0.2, "falls on one side, against its curvature"),
         (lambda s: -2.0, "falls on both sides, against its curvature"),
     ],

@@ -43,7 +43,7 @@ def test_the_titles_name_the_direction_and_say_how_the_loss_curves_beside_the_cu
     center = data["slice"]["center_loss"]
     arrays["slice"]["loss"] = center + 3 * (arrays["slice"]["model"] - center)
     above, below = (axes.get_title(loc="left") for axes in slice1d.draw(written(tmp_path / "slice", data, arrays)).axes)
-    name, said = data["slice"]["directions"][0]["name"], "what its\ncurvature says, at 0.15 to 1.5 units"
+    name, said = data["slice"]["directions"][0]["name"], "what its\ncurvature says, at 0.15 to 1.5 curvature units"
     assert above == f"Along {name} the loss curves up 3.0 times {said}"
     steps = f"{rough(1e-5)} to {rough(1e-3)}"
     assert below == f"At finite steps 1.0 to 1.8 times the curvature\n(steps of {steps}; bars: round-off)"

@@ -75,6 +75,7 @@ GLOSSARY = {  # of the words that a page uses
     "carries": "has a part of the squared length of a direction, or of the sum of all curvatures",
 }
 OPTION = re.compile(r"--[a-z][a-z-]*")  # of a command, which a page must not break
+THINNEST = 2.0  # px, half axes of an outline
 ROOM, SMALLEST = 3.0, 6  # of the part around an outline: in its half length; at least 1 / SMALLEST of the picture
 PACKED = 4  # level of gzip of plotly.js: at the usual 6 it takes twice as long for 4% fewer bytes
 
@@ -176,7 +177,7 @@ def title(data: ProbeRecord) -> str:
     """Title of the page: scene, views and steps, as far as they are known."""
     scene, steps, count = data.provenance.scene, plain(data.provenance).get("iteration"), data.counts.views
     parts = [f"Loss landscape of {scene or 'a checkpoint'}", f"{count:,} view{'' if count == 1 else 's'}"]
-    return ", ".join(parts + ([] if steps is None else [f"{steps:,} steps"]))
+    return ", ".join(parts + ([f"{steps:,} steps"] if steps else []))
 
 
 def place_of(record: Record[ProbeRecord], views: list[dict[str, Any]]) -> dict[str, Any] | None:
@@ -196,7 +197,7 @@ def place_of(record: Record[ProbeRecord], views: list[dict[str, Any]]) -> dict[s
     wide = side * width / height
     left, top = (min(max(at - size / 2, 0), most - size) for at, size, most in ((x, wide, width), (y, side, height)))
     boxes = [(0, 0, width, height), (round(left), round(top), round(wide), round(side))]
-    ellipse = {"cx": x, "cy": y, "rx": max(long, 2.0), "ry": max(short, 2.0)}
+    ellipse = {"cx": x, "cy": y, "rx": max(long, THINNEST), "ry": max(short, THINNEST)}
     return view and {"view": view, "ellipse": ellipse, "angle": math.degrees(angle), "boxes": boxes}
 
 

@@ -100,7 +100,7 @@ def _end(end: Eigenvalue) -> str:
     if renders and renders.optimiser_step and (value > 0 or renders.confirmed):
         at = renders.at_step
         over = "hidden by round-off" if at is None else rough(at * value)
-        kinks = f", which see kinks of L1 too, about {rough(renders.kinks)} at short steps" if renders.kinks else ""
+        kinks = f"; kinks of L1 add about {rough(renders.kinks)} at short steps" if renders.kinks else ""
         notes.insert(0, f"{over} over the optimiser's step in renders{kinks}")
     text = f"{solved(value, end.residual)}{apart(end.views_error)} ({'; '.join(notes)})"
     return f"{text}{_carrier(end)}; {_rendered(end)}"
@@ -129,8 +129,7 @@ def _rendered(end: Eigenvalue) -> str:
     if not renders:
         return "not rendered"
     if renders.confirmed:
-        last = ", the longest tried" if renders.high == renders.steps[-1] else ""
-        return f"renders agree within a factor of 2 at steps of {rough(renders.low)} to {rough(renders.high)}{last}"
+        return f"renders agree within a factor of 2 at steps of {rough(renders.low)} to {rough(renders.high)}"
     if renders.confirmed is None:
         return "not resolved: round-off hides it in renders"
     value, why = end.value or 0.0, ""
