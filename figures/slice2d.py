@@ -163,9 +163,8 @@ def _legend(field: Plane) -> list[Line2D]:
     if field.crossed is not None and field.crossed.any():
         words = f"order changed: {field.crossed.sum():,}\nof {field.evaluated.sum():,} renders"
         marked = any(_crossed(field, axis).any() for axis in (0, 1))
-        handles.append(
-            Line2D([], [], label=words, **({**CROSSED, "markersize": 6} if marked else {"linestyle": "none"}))
-        )
+        look: dict[str, Any] = {**CROSSED, "markersize": 6} if marked else {"linestyle": "none"}
+        handles.append(Line2D([], [], label=words, **look))
     if field.model is not None:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
     handles.append(Line2D([], [], linestyle="none", label=f"1 curvature unit:\nΔL = {quantity(field.loss_scale)}"))

@@ -98,8 +98,7 @@ def index_of(bracket: Bracket) -> schema.Index:
 def trace_record(trace: TraceEstimate, left_out: LeftOut | None = None, rank: int | None = None) -> schema.Trace:
     """rank: of the block, where it is below its size: for colours, the directions that some view sees."""
     numbers = {**trace.record(), **({} if rank is None else {"dim": rank})}
-    method = "exact, but SSIM's window is sampled" if numbers["probes"] else "exact"
-    method = "Gauss-Newton, by backward passes" if trace.method == "pixels" else method
+    method = "Gauss-Newton, by backward passes" if trace.method == "pixels" else trace.method
     tau = curvature_scale(numbers["value"] or 0.0, numbers["dim"], 1, "active")
     found = convert({**numbers, "tau": tau, "method": method}, schema.Trace)
     found.views_error = UNSET if left_out is None else trace.left_out(left_out.population)

@@ -17,8 +17,8 @@ class TraceEstimate:
     block, dim: its name and number of rows.  low, high: an interval that contains the trace with probability `confidence`.
     samples: one for each of `probes` random vectors, in order; value is their mean, standard_error the error of the mean.  With
     the method "exact" there are none.  matvecs: products used; blocks that are read from the same products each count them all.
-    method: "hutchinson", "hutch++", "xtrace", "exact" (`landscape.traces.trace`) or "pixels" (`pixels`).  terms: where H is the
-    mean of several operators whose traces are known apart, the estimate of each.
+    method: "hutchinson", "hutch++", "xtrace", "exact" (`landscape.traces.trace`), "pixels" (`pixels`) or words.  terms: where H
+    is the mean of several operators whose traces are known apart, the estimate of each.
     """
 
     block: str

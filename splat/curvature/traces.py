@@ -34,6 +34,7 @@ from landscape.traces.hutchinson import CONFIRMATION, WIDENING, StoppingRule, Tr
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
 
+SAMPLED = "exact, but SSIM's window is sampled"
 ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
 LEAST_SAMPLES = 4  # for a mean, a slope, and a variance with two degrees of freedom
 COLUMNS = 5  # most vectors in a pass over the pixels: one for each attribute
@@ -229,7 +230,7 @@ class SampledTrace:
             reason = "tolerance"
         return TraceEstimate(
             self.name, self.dim, value, error, value - half, value + half, settings.confidence, self.count, self.count,
-            reason, samples, terms=terms,
+            reason, samples, SAMPLED, terms=terms,
         )  # fmt: skip
 
 
