@@ -205,9 +205,8 @@ def _parsed(arguments: Sequence[str]) -> tuple[Command, Any]:
                 if name == "train":
                     print(LPIPS)
                 raise
-        box = (
-            DRAWN.sub("", said.getvalue()).strip().replace("'None', ", "").replace(", 'None'", "")
-        )  # what leaving an option out means
+        # without 'None', what leaving an option out means
+        box = DRAWN.sub("", said.getvalue()).strip().replace("'None', ", "").replace(", 'None'", "")
         told = (match.expand(words) for pattern, words in SENTENCES.items() if (match := re.search(pattern, box, re.S)))
         raise InputError(f"{next(told)}; landscape {name} --help has all options, and an example")
     if name in ("-h", "--help"):

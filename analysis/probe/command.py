@@ -86,8 +86,7 @@ def _run(
         subject = open_subject(options.checkpoint, options.foreign, out)
         checkpoint, scene = subject.checkpoint, subject.scene
         checkpoint.training.move(device)
-        loss = LossSettings() if options.loss == "3dgs" else None
-        objective = subject.objective(loss=loss)
+        objective = subject.objective(loss=LossSettings() if options.loss == "3dgs" else None)
     guessed = guess(checkpoint.origin)
     say(*guessed, _introduction(scene, checkpoint, objective), console=console)
     say(
@@ -119,7 +118,7 @@ def _run(
             from analysis.probe.measures import measures  # slow to import
 
             with stages.stage("measures") as report:
-                data.measures = measures(subject, loss, options.seed, report)
+                data.measures = measures(subject, objective, options.seed, report)
         if folder is not None:
             objective.release()  # for the memory of the processes that draw
             ends = data.eigenvalues.max, data.eigenvalues.min

@@ -22,7 +22,6 @@ from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.field_sharpness import field_sharpness
 from splat.curvature.scores.new_poses import open_curvature, order_fragility
 from splat.curvature.scores.poses import Poses
-from splat.losses.reference import LossSettings
 from splat.scenes.splits import spread_views
 from splat.training.adam import Adam
 from splat.training.origin.subject import Subject
@@ -33,12 +32,15 @@ LENGTH = 0.01  # of the scene's size
 
 
 def measures(
-    subject: Subject, loss: LossSettings | None = None, seed: int = 0, progress: Progress = lambda *_: None
+    subject: Subject, objective: SceneObjective, seed: int = 0, progress: Progress = lambda *_: None
 ) -> dict[str, tuple[Number, Number]]:
-    """Each by name with its error; at new poses with _new behind its name.  loss: the training's by default."""
+    """Each by name with its error; at new poses with _new behind its name.  objective: of the subject; one on a GPU is made
+    again on the CPU, where the training moves to."""
     training = subject.checkpoint.training
-    training.move(torch.device("cpu"))
-    objective, gaussians, found = subject.objective(loss=loss), training.gaussians, {}
+    if objective.active.flat.device.type != "cpu":
+        training.move(torch.device("cpu"))
+        objective = subject.objective(loss=objective.loss_settings)
+    gaussians, found = training.gaussians, {}
     background = training.config.background_colour(gaussians.flat.dtype)
     seen = Poses([view.camera for view in objective.views], background, training.config.render)
     new = new_poses(subject)
@@ -65,9 +67,9 @@ def measures(
 def new_poses(subject: Subject) -> Poses:
     """Cameras of POSES held-out views."""
     config, flat = subject.checkpoint.training.config, subject.checkpoint.training.gaussians.flat
-    names = subject.checkpoint.scene.test
-    chosen = spread_views(subject.scene.select(names), POSES) if names else ()
-    cameras = [frame.camera for frame in subject.scene.select(chosen)] if chosen else []
+    held_out = subject.scene.select(subject.checkpoint.scene.test)
+    chosen = spread_views(held_out, POSES) if held_out else ()
+    cameras = [frame.camera for frame in subject.scene.select(chosen)]
     return Poses(cameras, config.background_colour(flat.dtype), config.render)
 
 

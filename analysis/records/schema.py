@@ -211,11 +211,6 @@ class Eigenvalues(Named[Eigenvalue], kw_only=True):
     power_max: Maybe[Eigenvalue] = UNSET
     power_min: Maybe[Eigenvalue] = UNSET
 
-    @property
-    def stand(self) -> bool:
-        """Whether neither end is doubted."""
-        return not (self.max.doubted or self.min.doubted)
-
 
 class Index(Struct, kw_only=True):
     """An index and its bracket.  value: None where undefined; low, high: None where unbounded."""

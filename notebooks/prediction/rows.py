@@ -17,7 +17,6 @@ from analysis.probe.measures import measures, new_poses
 from analysis.records.tables import columns_of
 from landscape import EigenSettings, extreme_eigenpairs, spectral_density
 from landscape.operators.operator import LiftedOperator, ScaledOperator
-from landscape.results import Measured
 from landscape.spectrum.anisotropy import anisotropy
 from landscape.spectrum.density import ActiveSpace
 from landscape.traces.trace import total_trace
@@ -45,10 +44,10 @@ def measured_row(path: Path) -> Row:
     background, config = training.config.background_colour(training.gaussians.flat.dtype), training.config
     psnr = {f"psnr_{part}": evaluate(training.gaussians, some, background, config.render).psnr
             for part, some in views.items()}  # fmt: skip
-    gaussians, row = training.gaussians, Row(psnr)
-    row |= {"step": training.step, "gaussians": len(gaussians)} | curvature(subject.objective(), training)
-    row |= columns_of(measures(subject))
-    row |= columns("coadaptation", coadaptation(gaussians, new_poses(subject), seeded()))
+    objective, gaussians, row = subject.objective(), training.gaussians, Row(psnr)
+    row |= {"step": training.step, "gaussians": len(gaussians)} | curvature(objective, training)
+    row |= columns_of(measures(subject, objective))
+    row |= columns_of({"coadaptation": coadaptation(gaussians, new_poses(subject), seeded())})
     return row | {"digest": subject.checkpoint.state, "scene_digest": scene_digest(subject)}
 
 
@@ -57,7 +56,7 @@ def ensemble_columns(path: Path, others: list[Path]) -> Row:
     subject = open_subject(path)
     trained = [load_checkpoint(each).training.gaussians for each in others]
     found = ensemble(subject.checkpoint.training.gaussians, trained, new_poses(subject))
-    return columns("ensemble", found) | {"ensemble_seeds": len(others)}
+    return columns_of({"ensemble": found}) | {"ensemble_seeds": len(others)}
 
 
 def scene_digest(subject: Subject) -> str:
@@ -68,10 +67,6 @@ def scene_digest(subject: Subject) -> str:
 def seeded() -> torch.Generator:
     """The same draws for every checkpoint and measure."""
     return torch.Generator().manual_seed(0)
-
-
-def columns(name: str, found: Measured) -> Row:
-    return {name: found.value, f"{name}_error": found.error}
 
 
 def curvature(objective: SceneObjective, training: Training) -> Row:
@@ -85,9 +80,9 @@ def curvature(objective: SceneObjective, training: Training) -> Row:
     ends = extreme_eigenpairs(lifted, seeded(), EigenSettings(rtol=0.01, max_matvecs=ENDS), start)
     density = spectral_density(operator, seeded(), DENSITY, active=ActiveSpace(P.apply, P.rank), ends=ends, trace=total)
     found = anisotropy(ends, density)
-    row = columns("trace", Measured(*total)) | columns("trace_means", Measured(means.value, means.standard_error))
+    row: Row = columns_of({"trace": total, "trace_means": (means.value, means.standard_error)})
     for name, pairs in {"lambda_max": ends.largest, "lambda_min": ends.smallest}.items():
-        row |= columns(name, Measured(float(pairs.values[0]), float(pairs.residuals[0])))
+        row |= columns_of({name: (float(pairs.values[0]), float(pairs.residuals[0]))})
     spread = found.participation_ratio
     assert spread is not None  # there is a density
     row |= {"eigenvalue_ratio": found.eigenvalue_ratio.value, "participation_ratio": spread.value}

@@ -39,7 +39,8 @@ def test_the_record_the_report_and_a_table_have_them(run, no_pictures, tmp_path)
     assert main(["probe", str(run), "--quick", "--measures", "--out", str(out)]) == 0
     data = read_record(out, ProbeRecord).data
     found = data.measures or {}
-    assert found == measures(open_subject(run))
+    subject = open_subject(run)
+    assert found == measures(subject, subject.objective())
     names = ["order_fragility", "order_fragility_new", "field_sharpness", "field_sharpness_new"]
     assert list(found) == [*names, "critical_sharpness", "open_curvature", "open_ratio"]
     assert all(value and value > 0 for value, _ in found.values())
@@ -55,6 +56,6 @@ def test_without_held_out_views_and_moments_what_needs_them_is_absent_or_not_kno
     subject = open_subject(run / "double.pt")
     subject.checkpoint.scene.test.clear()
     assert subject.checkpoint.training.adam.updates == 0
-    found = measures(subject)
+    found = measures(subject, subject.objective())
     assert list(found) == ["order_fragility", "field_sharpness", "critical_sharpness"]
     assert found["critical_sharpness"] == (None, None) and (found["field_sharpness"][0] or 0) > 0
