@@ -60,20 +60,13 @@ def absolute_integral(nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m
     >>> low, round(value, 9), high
     (0.0, 0.707106781, 1.0)
     """
-    if not len(nodes):
-        return 0.0, 0.0, 0.0
-    # a rule that is the measure itself has no bounds to either side
-    kept, scale = weights > 0, float(nodes.abs().max())
     gauss = float((weights * nodes.abs()).sum())
-    if scale == 0 or int(kept.sum()) == 1 or not kept.all():
+    T, scale = _tridiagonal(nodes, weights)
+    if T is None:
         return gauss, gauss, gauss
-    # back from nodes and weights to the tridiagonal T of the rule
-    (rule,) = lanczos(DenseOperator(torch.diag(nodes / scale)), weights.sqrt()[:, None], len(nodes))
-    T, size = rule.T, scale * float(weights.sum())
-    if len(T) == 1:  # all nodes are the same to round-off
-        return gauss, gauss, gauss
+    size = scale * float(weights.sum())
     # T(a) that is singular has a node at 0: the lower bound
-    least, unit = _singular_end(T), float(T[-1, -2].abs())
+    least, unit = float(_ends(T, T.new_zeros(1))), float(T[-1, -2].abs())
     centre = least if abs(least) < FAR else float(T[-1, -1])
 
     def integrals(steps: Tensor) -> Float64[Tensor, " s"]:
@@ -91,6 +84,34 @@ def absolute_integral(nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m
     return low, min(max(size * _anti_gauss_mean(T), low), high), high
 
 
+def rules_of_moments(
+    nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"], kinks: Float64[Tensor, " k"]
+) -> tuple[Float64[Tensor, "a m"], Float64[Tensor, "a m"]]:
+    """Nodes, ascending, and weights of the rules T(a) that have a node at a kink, and of a grid of a.
+
+    Over all measures with these moments the integral of a function that is linear but for one kink is least, or largest, where
+    T(a) has a node there, as for |x|; the other end is found to the grid's resolution.  A rule that is the measure itself has
+    no others.
+    """
+    T, scale = _tridiagonal(nodes, weights)
+    if T is None:
+        x, order = nodes.sort()
+        return x[None], weights[order][None]
+    ends = _ends(T, kinks / scale)
+    steps = T[-1, -1] + T[-1, -2].abs() * torch.sinh(torch.linspace(-REACH, REACH, 2 * RESOLUTION + 1, dtype=T.dtype))
+    values, shares = _rules(T, torch.cat([ends[ends.isfinite()], steps]))
+    return scale * values, float(weights.sum()) * shares
+
+
+def _tridiagonal(nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"]) -> tuple[Tensor | None, float]:
+    """T of this rule in units of the largest node, and this; None for a rule that is the measure itself."""
+    scale = float(nodes.abs().max()) if len(nodes) else 0.0
+    if scale == 0 or int((weights > 0).sum()) == 1 or not (weights > 0).all():
+        return None, scale
+    (rule,) = lanczos(DenseOperator(torch.diag(nodes / scale)), weights.sqrt()[:, None], len(nodes))
+    return (rule.T if len(rule.T) > 1 else None), scale  # of one row: all nodes are the same to round-off
+
+
 def _anti_gauss_mean(T: Float64[Tensor, "m m"]) -> float:
     """The integral of |x| by the mean of the (m - 1)-point Gauss rule and its anti-Gauss rule."""
     anti = T.clone()
@@ -100,17 +121,22 @@ def _anti_gauss_mean(T: Float64[Tensor, "m m"]) -> float:
     return sum(float((S[0].square() * values.abs()).sum()) for values, S in spectra) / 2
 
 
-def _singular_end(T: Float64[Tensor, "m m"]) -> float:
-    """The last diagonal entry that makes T singular: its last pivot becomes 0."""
-    pivot, coupling = float(T[0, 0]), 0.0
-    for j in range(1, len(T)):
-        coupling = float(T[j, j - 1]) ** 2 / pivot if pivot else inf
-        pivot = float(T[j, j]) - coupling
-    return coupling
+def _ends(T: Float64[Tensor, "m m"], places: Float64[Tensor, " p"]) -> Float64[Tensor, " p"]:
+    """The last diagonal entries a that give T(a) a node at each place; infinite where T without its last row has one there."""
+    x, S = torch.linalg.eigh(T[:-1, :-1])
+    return places + T[-1, -2].square() * (S[-1].square() / (x - places[:, None])).nan_to_num(nan=inf).sum(dim=1)
 
 
 def _absolute_integrals(T: Float64[Tensor, "m m"], ends: Float64[Tensor, " s"]) -> Float64[Tensor, " s"]:
-    """The integral of |x| by the rules of T(a), a in ends, for nodes in units of the largest.
+    """The integral of |x| by the rules of T(a), a in ends."""
+    values, weights = _rules(T, ends)
+    return (weights * values.abs()).sum(dim=1)
+
+
+def _rules(
+    T: Float64[Tensor, "m m"], ends: Float64[Tensor, " s"]
+) -> tuple[Float64[Tensor, "s m"], Float64[Tensor, "s m"]]:
+    """Nodes and weights of the rules of T(a), a in ends, for nodes in units of the largest.
 
     Beyond FAR the node at a has no weight left: the rule is that of T without its last row.
     """
@@ -118,4 +144,4 @@ def _absolute_integrals(T: Float64[Tensor, "m m"], ends: Float64[Tensor, " s"]) 
     rules[:, -1, -1] = ends.clamp(-FAR, FAR)
     rules[ends.abs() > FAR, -1, -2] = rules[ends.abs() > FAR, -2, -1] = 0.0
     values, vectors = torch.linalg.eigh(rules)
-    return (vectors[:, 0].square() * values.abs()).sum(dim=1)
+    return values, vectors[:, 0].square()

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from landscape import EigenSettings, extreme_eigenpairs, spectral_density
+from landscape.eigen.lanczos import lanczos
 from landscape.operators.operator import DenseOperator
-from landscape.spectrum.concentration import half, top
+from landscape.spectrum.concentration import excesses, half, top
 from landscape.spectrum.rules import SpectralDensity
 
 N = 200
@@ -15,6 +16,8 @@ SPECTRA = {
     "steep": PLACE**-1.2,
     "even": PLACE**-0.7,
     "of both signs": PLACE**-1.0 * torch.where(PLACE % 5 == 0, -0.3, 1.0),
+    "many at one node": torch.exp(-PLACE / 8) * torch.where(PLACE % 7 == 0, -0.1, 1.0),
+    "near 0": torch.where(PLACE <= N // 4, 1 / PLACE, 1e-6 / PLACE),
     "a few over many": torch.where(PLACE <= 5, 100 / PLACE, 1 / PLACE.sqrt()),
 }
 
@@ -40,6 +43,21 @@ def test_the_brackets_hold_as_often_as_they_say(name):
         assert all(each.value is not None and each.high <= 3 * each.value for each in found)  # they say something
     # four standard errors of a binomial count below its mean
     assert held.min() >= 0.95 * runs - 4 * (0.95 * 0.05 * runs) ** 0.5
+
+
+@pytest.mark.parametrize("name", SPECTRA)
+def test_each_start_vector_bounds_its_own_sums(name):
+    """The bounds of F(t) hold for the measure that a start vector sees, at every t."""
+    values, z = SPECTRA[name], torch.randn(N, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    z /= z.norm(dim=0)
+    runs = [run.T for run in lanczos(DenseOperator(torch.diag(values)), z, 12)]
+    rules = [torch.linalg.eigh(T) for T in runs]
+    nodes, weights = torch.stack([x for x, _ in rules]), torch.stack([S[0].square() for _, S in rules])
+    t, least, largest = excesses(SpectralDensity(nodes, weights, N, 24))
+    true = N * (z.T.square() @ (values.abs()[:, None] - t).clamp(min=0))
+    slack = 1e-12 * true[:, :1]
+    assert (least <= true + slack).all() and (true <= largest + slack).all()
+    assert ((largest - least) > 1e9 * slack).any()  # a rule by itself is one number of those between
 
 
 def test_of_a_spectrum_that_is_known_whole_the_numbers_are_exact():
