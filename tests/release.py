@@ -2,7 +2,8 @@
 
 A wheel is built and installed into a new environment, which otherwise has the packages of this one; there, in an empty folder,
 the demonstration, every block of code of the README and the pages (but `make` and the activation of an environment), and the
-examples of all docstrings run.  The scene is the demonstration's, at few steps.  Of a clone there are the notebooks alone.
+examples of all docstrings run.  The scene is the demonstration's, at few steps.  Of a clone there are the notebooks alone, and
+at the end the compilation of every kernel for GPUs.
 """
 
 import re
@@ -55,18 +56,9 @@ def main() -> None:
             elif (words := ["python", "-c", code] if code else shortened(command, trials)) and words not in tried:
                 tried.append(words)
                 run(*words)
-    packages = [site / name for name in PACKAGES]
-    run(
-        "python",
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "--import-mode=importlib",
-        "--doctest-modules",
-        *packages,
-    )
+    pytest = ["python", "-m", "pytest", "-q", "-p", "no:cacheprovider", "--import-mode=importlib"]
+    run(*pytest, "--doctest-modules", *(site / name for name in PACKAGES))
+    run(*pytest, "--rootdir", ROOT, ROOT / "tests" / "splat" / "gpu" / "every_kernel.py")
 
 
 def environment(folder: Path) -> Path:

@@ -84,7 +84,7 @@ def zeros(make: Any) -> Any:
 
 def kernels() -> list[str]:
     """The names of those that the test of the compiler knows."""
-    from tests.splat.gpu.test_compiles import others, rasterizer
+    from tests.splat.gpu.every_kernel import others, rasterizer
 
     return sorted({kernel.__name__ for kernel, *_ in rasterizer() + others()})
 

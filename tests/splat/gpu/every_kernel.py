@@ -1,4 +1,7 @@
-"""Every kernel compiles for GPUs, without one, and those of the rasterizer keep their numbers in registers."""
+"""Every kernel compiles for GPUs, without one, and those of the rasterizer keep their numbers in registers.
+
+That takes the best part of a minute: `make test-release` runs it.  On a GPU the tests marked `cuda` compile them all.
+"""
 
 from importlib.metadata import version
 
