@@ -20,12 +20,13 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "expected Python 3.11 or newer, got " + sys.version.split()[0] + "; name one with: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV), which takes minutes and 1.5 GB"
-	$(PIP) torch
-	$(PIP) --editable .
-	@touch $(STAMP)
+	$(PIP) --editable '.$(EXTRA)'
+	@touch $(STAMP) $(if $(EXTRA),$(TOOLS))
 
+# where nothing is installed, the rule above installs these too, in one go
+$(TOOLS): EXTRA := [dev]
 $(TOOLS): $(STAMP)
-	$(PIP) --editable '.[dev]'
+	@test -e $(TOOLS) -a ! $(TOOLS) -ot $(STAMP) || $(PIP) --editable '.[dev]'
 	@touch $(TOOLS)
 
 demo: setup
