@@ -9,7 +9,6 @@ from analysis.measures.gradient_check import ProductCheck
 from analysis.records.schema import Carries, Depth
 from landscape import EigenEnds, OperatorCheck, Slice, SpectralDensity, TraceEstimate
 from landscape.slices.finite_probe import FiniteProbe
-from splat.curvature.scores.shares import BlockShare
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,7 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Results of all stages; rendered, density, power, finite, depth, plane and shares are None where a note says why.
+    """Results of all stages; rendered, density, power, finite, depth and plane are None where a note says why.
 
     matvecs: products H v of all stages; spared: products of single views, known to be 0 and left out; rank: number of
     directions that are not exactly flat; spreads: see `Search`; unreached: stages that time did not reach; left_out: of
@@ -87,7 +86,6 @@ class Measured:
     depth: Depth | None
     plane: PlaneSlice | None
     rendered: Rendered | None
-    shares: list[BlockShare] | None
     matvecs: int
     spared: int
     rank: int

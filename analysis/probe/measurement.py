@@ -13,7 +13,6 @@
                         contain the iterates of the paper's power iteration
     finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
     depth *             the positions' gradient and curvature along the rays and across them, and finite steps both ways
-    block shares        the share of H that lies within the diagonal blocks of Gaussians
 
 * not in a quick probe.  Estimators stop at their accuracy or at a limit on products; their results say which.  Time ends them
 only at a deadline.  Numbers depend on the seed alone, also those of stages kept from an earlier run.
@@ -69,13 +68,12 @@ from splat.backend.cpu.threads import single_threaded, thread_count
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
-from splat.curvature.scores.shares import BlockShare, block_shares
 from splat.curvature.traces import block_traces, exact_traces
 from splat.model.gaussians import Gaussians
 from splat.render.backend import CPU, backend_of
 
-# each stage has random numbers of its own; "": those of one that is gone, so that the others keep theirs
-STREAMS = ("traces", "eigenvalues", "slice", "density", "", "finite probe", "depth", "block shares", "renders")
+# each stage has random numbers of its own; "": those of stages that are gone, so that the others keep theirs
+STREAMS = ("traces", "eigenvalues", "slice", "density", "", "finite probe", "depth", "", "renders")
 LEFT_OUT = {  # notes on stages that the settings exclude
     "density": "the spectral density was left out, and the indices that need it",
     "finite probe": "the finite probe was left out",
@@ -172,7 +170,6 @@ def _all_stages(
         finite = kept.run("finite probe", FiniteProbe, partial(_finite, at, ends))
     if settings.depth is not None:
         depth = kept.run("depth", Depth, partial(_depth, at, settings.depth))
-    shares = kept.run("block shares", list[BlockShare], partial(_shares, at))
     matvecs, spared = (sum(both) for both in zip(of_checks, kept.counts, strict=True))
     spared = int(at.ranks.sum(torch.tensor(spared)))
     wanted = {"density": settings.density_matvecs, "finite probe": settings.probe_steps, "depth": settings.depth}
@@ -190,7 +187,6 @@ def _all_stages(
         depth=depth,
         plane=plane,
         rendered=rendered,
-        shares=shares,
         matvecs=matvecs,
         spared=spared,
         rank=at.hessian.rank,
@@ -312,11 +308,6 @@ def _rendered(
 
 def _depth(at: _Point, accuracy: TraceSettings, generator: torch.Generator, report: Progress, _: list[str]) -> Depth:
     return measure_depth(at.objective, accuracy, at.settings.depth_steps, generator, report)
-
-
-def _shares(at: _Point, generator: torch.Generator, report: Progress, _: list[str]) -> list[BlockShare]:
-    samples, ssim_window = at.settings.block_samples, at.settings.block_ssim_window
-    return block_shares(at.objective, generator, samples, report, ssim_window=ssim_window)
 
 
 def _plane(

@@ -50,5 +50,4 @@ def expected_seconds(settings: ProbeSettings, render: float, further: float = 0.
     products += 0.3 * settings.density_matvecs
     renders += 2 * len(settings.probe_steps) + settings.noise_points + 1 if settings.probe_steps else 0
     products, renders = (products, renders) if settings.depth is None else (products + 3, renders + 60)
-    products += 24 if settings.block_ssim_window else 4  # block shares: exact blocks take longest
     return (PRODUCT * products + renders) * render + (PICTURES if settings.slice_plane else QUICK_PICTURES)

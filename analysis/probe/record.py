@@ -22,7 +22,6 @@ from landscape.slices.finite_probe import FiniteProbe
 from landscape.spectrum.concentration import half, top
 from landscape.spectrum.rules import SpectralDensity
 from splat.curvature.objective import SceneObjective
-from splat.curvature.scores.shares import BlockShare
 from splat.curvature.traces import curvature_scale
 
 NAMES = ("e₁", "e₂")  # of the slice's directions
@@ -44,7 +43,6 @@ def probe_record(
         concentration=concentration_record(found.density),
         finite_probe=found.finite and finite_record(found.finite),
         depth=found.depth,
-        block_shares=UNSET if found.shares is None else [_block_share(one) for one in found.shares],
         step_rises=UNSET if found.rendered is None else found.rendered.rises,
         slice=found.plane and slice_record(found.plane, found.ends.largest),
         counts=_counts(found, objective),
@@ -103,14 +101,6 @@ def trace_record(trace: TraceEstimate, left_out: LeftOut | None = None, rank: in
     found = convert({**numbers, "tau": tau, "method": method}, schema.Trace)
     found.views_error = UNSET if left_out is None else trace.left_out(left_out.population)
     return found
-
-
-def _block_share(found: BlockShare) -> schema.BlockShare:
-    blocks, attributes, diagonal = map(finite_or_none, (found.blocks, found.attributes, found.diagonal))
-    return schema.BlockShare(
-        operator="gauss-newton" if found.gauss_newton else "hessian", ssim_window=found.ssim_window, blocks=blocks,
-        attributes=attributes, diagonal=diagonal, norm=found.norm, relative_error=found.error, samples=found.samples,
-    )  # fmt: skip
 
 
 def eigenvalue_record(of: EigenEnds, pairs: Eigenpairs, index: int, blocks: Mapping[str, slice]) -> schema.Eigenvalue:

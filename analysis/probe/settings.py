@@ -27,7 +27,6 @@ class ProbeSettings:
     probe_steps: of the finite probe, units of the parameters; (): left out.  noise_points: renders from which it tells the
         noise of a render.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
-    block_samples: of the share of H within the Gaussians' blocks; block_ssim_window: with SSIM's window, too.
     memory: GiB for the vectors of a basis.
     """
 
@@ -47,8 +46,6 @@ class ProbeSettings:
     depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=1024))
     depth_steps: tuple[float, ...] = DEPTH_STEPS
     noise_points: int = NOISE_POINTS
-    block_samples: int = 8
-    block_ssim_window: bool = True
     memory: float = 2.0
 
     def __post_init__(self) -> None:
@@ -75,6 +72,4 @@ class ProbeSettings:
             slice_plane=False,
             probe_steps=(),
             depth=None,
-            block_samples=4,
-            block_ssim_window=False,
         )

@@ -128,7 +128,6 @@ class ProbeRecord(Struct, kw_only=True):
     concentration: Maybe[schema.Concentration] = UNSET
     finite_probe: schema.FiniteProbe | None = None
     depth: schema.Depth | None = None
-    block_shares: Maybe[list[schema.BlockShare]] = UNSET
     steps: Maybe[dict[str, float]] = UNSET
     step_rises: Maybe[dict[str, tuple[float, float]]] = UNSET
     measures: Maybe[dict[str, tuple[schema.Number, schema.Number]]] = UNSET

@@ -307,24 +307,6 @@ class Depth(Struct, kw_only=True):
     rises: list[Rise]
 
 
-class BlockShare(Struct, kw_only=True):
-    """Share of an operator's squared entries within the diagonal blocks of Gaussians (`splat.curvature.scores.shares`).
-
-    ssim_window: with SSIM's window.  blocks: share within the 11 x 11 of geometry and the diagonal of SH; attributes:
-    within the attributes' blocks of these; diagonal: on the diagonal; None where the operator is 0.  norm: squared Frobenius
-    norm.  relative_error: relative standard error of the norm and of each share.  samples: random vectors.
-    """
-
-    operator: Operator
-    ssim_window: bool
-    blocks: Number
-    attributes: Number
-    diagonal: Number
-    norm: float
-    relative_error: float
-    samples: Count
-
-
 class BlockAnisotropy(Struct, kw_only=True):
     """The anisotropy of one diagonal block of one operator (`analysis.measures.per_attribute`).
 

@@ -1,7 +1,7 @@
 """Tables of a probe's record: all numbers, for the report; the anisotropy families, for the terminal and the report."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +23,7 @@ from analysis.records.quantities import (
     rough,
 )
 from analysis.records.records import Check, Counts, ProbeRecord
-from analysis.records.schema import INDICES, BlockAnisotropy, BlockShare, Depth, Effect, End, FiniteProbe, Index, Number
+from analysis.records.schema import INDICES, BlockAnisotropy, Depth, Effect, End, FiniteProbe, Index, Number
 
 ENDS = {
     "max": "largest eigenvalue",
@@ -57,7 +57,6 @@ def number_rows(data: ProbeRecord) -> dict[str, list[Row]]:
         "Finite steps along e₁": _finite_rows(data.finite_probe),
         "Positions along and across the rays": _depth_rows(data.depth),
         "Beyond derivatives at the training views": _measure_rows(data.measures or {}),
-        "Shares within blocks": _share_rows(data.block_shares or []),
         "Sizes": _count_rows(data.counts),
         "Checks": _check_rows(data.checks),
     }
@@ -166,15 +165,6 @@ def _measure_rows(found: Mapping[str, tuple[Number, Number]]) -> Iterator[Row]:
         kind = name.removesuffix("_new")
         about = MEASURES[kind] + (", at new poses" if name != kind else "")
         yield kind.replace("_", " "), quantity(number[0]) if name == "open_ratio" else measured(*number), about
-
-
-def _share_rows(shares: Iterable[BlockShare]) -> Iterator[Row]:
-    """Rows of the shares of operators' squared entries."""
-    for one in shares:
-        window = "" if one.ssim_window else ", without SSIM's window"
-        about = f"attributes' blocks {quantity(one.attributes)}, diagonal {quantity(one.diagonal)}"
-        error = None if one.blocks is None else one.blocks * one.relative_error
-        yield f"in blocks: {OPERATOR_NAMES[one.operator]}{window}", measured(one.blocks, error), about
 
 
 def _index(index: Index) -> tuple[str, str]:

@@ -6,7 +6,6 @@ Rows and columns are stored parameters: mean, log-scales, quaternion w x y z, op
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
@@ -38,24 +37,6 @@ class PerGaussianBlocks(ShortRepr):
         """Add a diagonal, given by attribute in GEOMETRY_COLUMNS, in place."""
         for name, part in parts.items():
             self.geometry.diagonal(dim1=1, dim2=2)[:, GEOMETRY_COLUMNS[name]] += part.view(len(part), -1)
-
-    def apply(self, V: Float[Tensor, "p k"], gaussians: Gaussians) -> Float[Tensor, "p k"]:
-        """B V, the columns of V laid out like `gaussians.flat`."""
-        rows, result = gaussians.blocks, torch.empty_like(V)
-        n, vectors = len(gaussians), V.shape[1]
-        parts = [V[rows[name]].view(n, -1, vectors) for name in GEOMETRY_COLUMNS]
-        found = self.geometry.to(V) @ torch.cat(parts, dim=1)
-        for name, columns in GEOMETRY_COLUMNS.items():
-            result[rows[name]] = found[:, columns].reshape(-1, vectors)
-        result[rows["sh"]] = self.sh.to(V).reshape(-1, 1) * V[rows["sh"]]
-        return result
-
-    def across(self, quats: Float[Tensor, "n 4"]) -> "PerGaussianBlocks":
-        """P B P, where P projects out the unit quaternions quats."""
-        q = self.geometry.new_zeros(len(quats), 11, 1)
-        q[:, GEOMETRY_COLUMNS["quats"], 0] = quats.to(q)
-        half = self.geometry - q @ (q.mT @ self.geometry)
-        return PerGaussianBlocks(half - (half @ q) @ q.mT, self.sh)
 
     def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
         """Trace of each attribute's block, summed in double precision.

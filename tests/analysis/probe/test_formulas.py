@@ -25,7 +25,7 @@ from splat.training.state import TrainConfig, Training
 from tests.analysis.probe.probed import SCENE
 
 STORED = Path(__file__).with_name("formulas.json")
-PARTS = ("objective", "traces", "eigenvalues", "anisotropy", "slice", "counts", "block_shares", "steps")
+PARTS = ("objective", "traces", "eigenvalues", "anisotropy", "slice", "counts", "steps")
 ROUND_OFF = ("residual", "vector_error", "errors", "products", "matvecs", "renders", "evaluations", "crossed_points")
 BOUND = 1e-3  # of a number: in double precision the numbers of processors differ by far less
 

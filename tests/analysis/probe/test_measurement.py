@@ -38,7 +38,7 @@ def test_the_blocks_of_the_gaussians_are_made_once(monkeypatch):
 
     monkeypatch.setattr(SceneObjective, "block_diagonal", call)
     objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
-    settings = replace(ProbeSettings.quick(), slice_points=5, block_ssim_window=True)
+    settings = replace(ProbeSettings.quick(), slice_points=5)
     found = measure(objective, settings, steps(objective), torch.Generator().manual_seed(0), Stages())
     assert sorted(calls) == ["gauss_newton", "hessian"]
     assert found.value == pytest.approx(objective.loss(objective.active.flat))

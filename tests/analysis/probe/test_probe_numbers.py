@@ -8,7 +8,6 @@ import torch
 
 from analysis.measures.depth import STEPS, depth_split
 from analysis.probe.record import paper_index
-from analysis.records.quantities import measured
 from analysis.records.tables import number_rows
 from landscape import DenseOperator, EigenSettings, PowerSettings, extreme_eigenpairs, power_ends
 from splat.curvature.hessian import SceneHessian
@@ -149,23 +148,3 @@ def test_positions_are_split_along_and_across_the_rays(record, dense):
     names = {name for name, *_ in number_rows(record.data)["Positions along and across the rays"]}
     assert names >= {"depth gradient / lateral", "depth curvature / lateral"}
     assert names >= {f"depth / lateral rise, {step:g} px" for step in STEPS}
-
-
-def test_the_share_within_gaussians_blocks_is_that_of_the_dense_hessian(record, dense):
-    objective, H, _, _ = dense
-    found = record.data.block_shares
-    assert [(one.operator, one.ssim_window) for one in found] == [
-        ("hessian", True),
-        ("gauss-newton", True),
-        ("hessian", False),
-        ("gauss-newton", False),
-    ]
-    inside = torch.eye(len(H), dtype=torch.bool)
-    names = [name for name in ATTRIBUTES if name != "sh"]
-    index = [torch.arange(len(H))[objective.blocks[name]].view(len(objective.active), -1) for name in names]
-    for own in torch.cat(index, dim=1):
-        inside[own[:, None], own] = True
-    share = float(H[inside].square().sum() / H.square().sum())
-    assert abs(found[0].blocks - share) < 5 * share * found[0].relative_error and found[0].relative_error < 0.1
-    rows = number_rows(record.data)["Shares within blocks"]
-    assert rows[0][:2] == ("in blocks: Hessian", measured(found[0].blocks, found[0].blocks * found[0].relative_error))

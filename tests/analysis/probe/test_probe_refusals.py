@@ -77,7 +77,7 @@ def test_an_interrupted_probe_keeps_its_stages_and_says_how_to_go_on(run, tmp_pa
     assert main(words) == 130
     assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]
     said = capsys.readouterr().err
-    assert "kept: block shares, eigenvalues, renders, slice, traces; the same command continues" in said
+    assert "kept: eigenvalues, renders, slice, traces; the same command continues" in said
     assert " ".join(words) in said
     monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(lambda target: []))
     monkeypatch.setattr("analysis.probe.measurement.extreme_eigenpairs", None)  # it is not searched for again
