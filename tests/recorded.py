@@ -108,7 +108,7 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
     found = {"matvecs": 60, "method": "lanczos"}
     ends = {
         "max": {"value": top, "residual": 12.0 * scale, **found, "reason": "tolerance"},
-        "min": {"value": bottom, "residual": 3.0 * scale, **found, "reason": "time budget"},
+        "min": {"value": bottom, "residual": 3.0 * scale, **found, "reason": "matvec budget"},
     }
     indices = {
         "eigenvalue_ratio": {"value": top / bottom, "low": -143.0, "high": -139.0, "note": ""},

@@ -10,9 +10,8 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
-from math import inf, isfinite
 from pathlib import Path
-from time import monotonic, perf_counter
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -54,7 +53,6 @@ if TYPE_CHECKING:
     from analysis.measures.per_attribute import PerAttributeOptions
 
 CHECK_FAILED = 1
-DRAWING = 8.0  # seconds of the time limit that are left for the record and its pictures
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
@@ -72,12 +70,13 @@ def _run(
     options: ProbeOptions, command: Sequence[str], drawn: Draw | None, device: torch.device, ranks: Ranks | None
 ) -> int:
     """The probe in this process.  ranks: of the processes that share the views, where there are several."""
-    start, begun = perf_counter(), monotonic()
+    start = perf_counter()
     out = options.out or options.checkpoint.parent / ("probe-quick" if options.quick else "probe")
     settings, families = probe_settings(options), _family_options(options)
-    limit = inf if options.seconds is None else options.seconds
-    if ranks is not None:
-        _require_same_in_all_processes(limit, families)
+    if ranks is not None and families is not None:
+        raise InputError(
+            "expected no --per-attribute, --split-control or --metric under torchrun, got one; run it in one process"
+        )
     writes = ranks is None or ranks.rank == 0
     console, unfinished = Console(stderr=True, quiet=not writes), out.with_name(f".{out.name}.unfinished")
     require_replaceable(out)
@@ -101,7 +100,7 @@ def _run(
         rates = checkpoint.training.config.rates, checkpoint.training.extent
         found = measure(
             objective, settings, optimiser_units(objective, *rates), generator, stages, None if ranks else unfinished, identity,
-            deadline=begun + limit - DRAWING, population=checkpoint.all_views, ranks=ranks or ALONE,
+            population=checkpoint.all_views, ranks=ranks or ALONE,
         )  # fmt: skip
         origin = provenance_of(made, subject, command)
         data = probe_record(found, objective, origin, stages.timing)
@@ -126,23 +125,13 @@ def _run(
             write_with_pictures(folder, data, arrays, stages, start, drawn)
             write_report(folder)
     if writes:
-        if not found.unreached:
-            shutil.rmtree(unfinished, ignore_errors=True)
+        shutil.rmtree(unfinished, ignore_errors=True)
         conclude(data, out, guessed)
         of = options.checkpoint.parent if options.checkpoint.name == CHECKPOINT else options.checkpoint
         more = ", with the options on its tool and scene" if options.foreign.scene else ""
         say(f"next: open the report in a browser; landscape map {shlex.quote(str(of))}{more}")
     failed = any(check.passed is False for check in data.checks.values())
     return CHECK_FAILED if options.strict and failed else 0
-
-
-def _require_same_in_all_processes(limit: float, families: "PerAttributeOptions | None") -> None:
-    if isfinite(limit):  # the processes' clocks differ, and all must measure the same
-        raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {limit:g}")
-    if families is not None:
-        raise InputError(
-            "expected no --per-attribute, --split-control or --metric under torchrun, got one; run it in one process"
-        )
 
 
 @contextmanager
@@ -165,8 +154,6 @@ def asked(options: ProbeOptions, checkpoint: Checkpoint) -> Fingerprint:
 
 
 def probe_settings(options: ProbeOptions) -> ProbeSettings:
-    if options.seconds is not None and not options.seconds > 0:
-        raise InputError(f"expected --seconds above 0, got {options.seconds:g}")
     settings = ProbeSettings.quick() if options.quick else ProbeSettings()
     changes: dict[str, Any] = {"slice_points": options.slice_points, "density_matvecs": options.density_products}
     if options.end_products is not None:

@@ -69,8 +69,7 @@ class Measured:
     """Results of all stages; rendered, density, power, finite, depth and plane are None where a note says why.
 
     matvecs: products H v of all stages; spared: products of single views, known to be 0 and left out; rank: number of
-    directions that are not exactly flat; spreads: see `Search`; unreached: stages that time did not reach; left_out: of
-    training views, if any were.
+    directions that are not exactly flat; spreads: see `Search`; left_out: of training views, if any were.
     """
 
     value: float
@@ -90,5 +89,4 @@ class Measured:
     spared: int
     rank: int
     notes: tuple[str, ...]
-    unreached: tuple[str, ...] = ()
     left_out: LeftOut | None = None

@@ -14,8 +14,8 @@
     finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
     depth *             the positions' gradient and curvature along the rays and across them, and finite steps both ways
 
-* not in a quick probe.  Estimators stop at their accuracy or at a limit on products; their results say which.  Time ends them
-only at a deadline.  Numbers depend on the seed alone, also those of stages kept from an earlier run.
+* not in a quick probe.  Estimators stop at their accuracy or at a limit on products; their results say which.  Numbers depend
+on the seed alone, also those of stages kept from an earlier run.
 """
 
 from collections.abc import Sequence
@@ -95,13 +95,12 @@ def measure(
     stages: Stages,
     folder: Path | None = None,
     identity: str = "",
-    deadline: float = inf,
     population: int | None = None,
     ranks: Ranks = ALONE,
 ) -> Measured:
     """Run every stage.
 
-    steps: the optimiser's first in each parameter.  folder, identity, deadline: see `Kept`.  population:
+    steps: the optimiser's first in each parameter.  folder, identity: see `Kept`.  population:
     number of training views, where the objective has fewer.  ranks: processes that all measure the same, and share the views of
     the operator's products.
     """
@@ -111,7 +110,7 @@ def measure(
         operator_check = check_operator(at.operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(at.hessian, spawn(generator), report, settings.checked_views)
     of_checks = at.work()
-    kept = Kept(stages, generator, STREAMS, at.work, folder, identity, deadline)
+    kept = Kept(stages, generator, STREAMS, at.work, folder, identity)
     return _all_stages(at, steps, kept, operator_check, gradient_check, of_checks, population)
 
 
@@ -157,9 +156,8 @@ def _all_stages(
 ) -> Measured:
     """The stages after the checks.  of_checks: `_Point.work` that these took."""
     settings = at.settings
-    traces = kept.run("traces", dict[str, TraceEstimate], partial(_traces, at, kept), ends_in_time=True)
-    search = kept.run("eigenvalues", Search, partial(_ends, at, kept), ends_in_time=True)
-    assert traces is not None and search is not None  # stages that end in time always return something
+    traces = kept.run("traces", dict[str, TraceEstimate], partial(_traces, at))
+    search = kept.run("eigenvalues", Search, partial(_ends, at))
     ends = search.ends
     rendered = kept.run("renders", Rendered, partial(_rendered, at, ends, steps))
     plane = kept.run("slice", PlaneSlice | None, partial(_plane, at, ends))  # pyright: ignore[reportArgumentType]
@@ -191,7 +189,6 @@ def _all_stages(
         spared=spared,
         rank=at.hessian.rank,
         notes=(*(LEFT_OUT[name] for name, each in wanted.items() if not each), *kept.notes),
-        unreached=tuple(kept.unreached),
         left_out=None if population is None else _left_out(at, ends, population),
     )
 
@@ -201,11 +198,9 @@ def _left_out(at: _Point, ends: EigenEnds, population: int) -> LeftOut:
     return LeftOut(population, at.objective.losses, SceneHessian(at.objective).by_view(vectors))
 
 
-def _traces(
-    at: _Point, kept: Kept, generator: torch.Generator, report: Progress, _: list[str]
-) -> dict[str, TraceEstimate]:
+def _traces(at: _Point, generator: torch.Generator, report: Progress, _: list[str]) -> dict[str, TraceEstimate]:
     """Traces at their accuracy; on a CPU, those that need more than MOST_SAMPLES samples are summed over exact blocks."""
-    allowed, samples = replace(at.settings.traces, max_seconds=kept.left), at.settings.trace_samples
+    allowed, samples = at.settings.traces, at.settings.trace_samples
     if samples or not backend_of(at.objective.active.flat).exact_blocks:
         return exact_traces(at.objective, generator, allowed, report, samples=samples)
     few = replace(allowed, max_probes=min(allowed.max_probes, MOST_SAMPLES))
@@ -215,8 +210,8 @@ def _traces(
     return {name: exact[name] if name in inexact else trace for name, trace in found.items()}
 
 
-def _ends(at: _Point, kept: Kept, generator: torch.Generator, report: Progress, notes: list[str]) -> Search:
-    """Both ends of the spectrum, in the time that is left and with the largest basis that fits into memory.
+def _ends(at: _Point, generator: torch.Generator, report: Progress, notes: list[str]) -> Search:
+    """Both ends of the spectrum, with the largest basis that fits into memory.
 
     The null space that is known is lifted off 0, where it would be the end of a semi-definite spectrum.
     """
@@ -228,7 +223,7 @@ def _ends(at: _Point, kept: Kept, generator: torch.Generator, report: Progress, 
             "and half of what was free"
         )
     start = BlockEigenvectors(at.objective, *at.objective.approximate_blocks).warm_start()
-    eigen = replace(eigen, max_seconds=kept.left, basis=basis)
+    eigen = replace(eigen, basis=basis)
     lifted = LiftedOperator(at.operator, at.hessian.project, spawn(generator))
     found = extreme_eigenpairs(lifted, generator, eigen, start, report)
     assert found.further is not None

@@ -28,9 +28,6 @@ class ProbeOptions:
     quick: bool = False
     """Numbers to 10%, in a quarter of the time, into probe-quick; without density, indices that need it, power iteration,
     finite probe, depth, and the slice's plane."""
-    seconds: float | None = None
-    """Time for all, pictures too; the same command continues.
-    Default: no limit.  Not under torchrun."""
     density_products: int | None = None
     """Of the spectral density; more narrow the brackets of sums.  Default: 108."""
     end_products: int | None = None
@@ -39,8 +36,8 @@ class ProbeOptions:
     """Along each side of the slice, odd, 5 or more.
     Default: 41, with --quick 21."""
     per_attribute: bool = False
-    """Also anisotropy of all attributes and of each, by four times as many products as the rest, which --seconds
-    does not end.  Not under torchrun."""
+    """Also anisotropy of all attributes and of each, by four times as many products as the rest.
+    Not under torchrun."""
     split_control: bool = False
     """The same, and of the scene with every Gaussian split in two: what their number alone does.  2.5 times as long."""
     metric: Annotated[Literal["parameters", "scene", "optimiser"], arg(metavar="NAME")] = "parameters"

@@ -47,11 +47,7 @@ def probe_record(
         slice=found.plane and slice_record(found.plane, found.ends.largest),
         counts=_counts(found, objective),
         checks=_checks(found, objective.counts.views),
-        notes=[
-            *found.notes,
-            *_unreached(found),
-            *left_out_note(objective.counts.views, left_out and left_out.population),
-        ],
+        notes=[*found.notes, *left_out_note(objective.counts.views, left_out and left_out.population)],
         skipped=_skipped(found, objective),
         provenance=made,
         timing=dict(timing),
@@ -191,12 +187,6 @@ def paper_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
     if certain.note not in ("definite", "indefinite"):
         note += f" ({certain.note})"
     return index_of(replace(certain, value=value, note=note))
-
-
-def _unreached(found: Measured) -> list[str]:
-    if not found.unreached:
-        return []
-    return [f"time ended before: {', '.join(found.unreached)}; the same command continues from there"]
 
 
 def finite_record(probe: FiniteProbe) -> schema.FiniteProbe:

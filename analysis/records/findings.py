@@ -169,8 +169,6 @@ def remedy(data: ProbeRecord, name: str) -> str:
     made, ends = data.provenance, data.eigenvalues
     command = made.command or f"landscape probe {made.checkpoint or 'CHECKPOINT'}"
     reasons = {end.reason for end in (ends.max, ends.min)}
-    if "time budget" in reasons:
-        return f"the same command without --seconds resolves it: {_without(command, '--seconds')}"
     if "matvec budget" in reasons:
         spent = ends.min.matvecs or 1
         return f"more products resolve it: {_with(command, '--end-products', 4 * spent)}"
@@ -180,12 +178,9 @@ def remedy(data: ProbeRecord, name: str) -> str:
     return "the smallest eigenvalue is within its error of 0, and no more products resolve it"
 
 
-def _without(command: str, option: str) -> str:
-    return re.sub(rf" {option}[ =]\S+", "", command)
-
-
 def _with(command: str, option: str, value: int) -> str:
-    return f"{_without(_without(command, '--seconds'), option)} {option} {value}"
+    without = re.sub(rf" {option}[ =]\S+", "", command)
+    return f"{without} {option} {value}"
 
 
 def _of_open(data: ProbeRecord) -> list[Line]:

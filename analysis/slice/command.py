@@ -163,7 +163,6 @@ def _measure(
     true = CountingOperator(hessian)
     find = partial(find_directions, shape, objective, operator, others, known, kept.streams)
     directions = kept.run("directions", list[Direction], lambda _, report, __: find(report))
-    assert directions is not None  # there is no deadline
     vectors = torch.stack([direction.vector for direction in directions], dim=1)
     curvatures = (vectors.double() * true.apply(vectors).double()).sum(dim=0).tolist()
     loss_scale = RISE * objective.loss(center)

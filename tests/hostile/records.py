@@ -188,7 +188,7 @@ def _write_trajectory(root: Path) -> None:
 
 def _write_sweep(root: Path) -> None:
     (root / "sweep.toml").write_text(
-        'out = "runs"\nseeds = [0, 1]\niterations = 30\nviews = 3\n[probe]\nseconds = 4.5\n'
+        'out = "runs"\nseeds = [0, 1]\niterations = 30\nviews = 3\n[probe]\nend_products = 45\n'
         '[scenes.fern]\npath = "fern"\nviews = 3\n[methods.3dgs]\n[methods."asp only"]\nmethod = "stablegs"\n'
         'set = { vsp_weight = 0, probe.attributes = ["means"] }\n'
     )

@@ -145,7 +145,6 @@ def _truth(kept: Kept, objective: SceneObjective, options: PruneOptions) -> Floa
     generator = torch.Generator().manual_seed(options.seed)
     chosen: Int64[Tensor, " m"] = torch.randperm(n, generator=generator)[: options.sample].sort().values
     found = kept.run(STAGES[0], Tensor, lambda _g, report, _n: removal_errors(objective, chosen, report))
-    assert found is not None  # there is no deadline
     errors = torch.full((n,), torch.nan, dtype=torch.float64)
     errors[chosen] = found
     return errors
@@ -200,8 +199,8 @@ def _curve(
     plain = [(removed, first) for removed in REMOVED]
     refined = [(removed, seed) for removed in REFINED for seed in range(first, first + SEEDS)]
     for name in SCORES:
-        rows += kept.run(name, list[Row], partial(points, name, 0, plain)) or []
-        rows += kept.run(f"{name} refined", list[Row], partial(points, name, STEPS, refined)) or []
+        rows += kept.run(name, list[Row], partial(points, name, 0, plain))
+        rows += kept.run(f"{name} refined", list[Row], partial(points, name, STEPS, refined))
     return pd.DataFrame(rows)
 
 

@@ -35,9 +35,9 @@ class Work:
         return Found(vector, parts=(torch.ones(2, 3),), inner=Found(vector.float()), names={"a": 0.1})
 
 
-def kept(folder, identity="this", work=None, **named):
+def kept(folder, identity="this", work=None):
     count = (lambda: [work.count]) if work else (lambda: [])
-    return Kept(Stages(), torch.Generator().manual_seed(0), ["first", "second"], count, folder, identity, **named)
+    return Kept(Stages(), torch.Generator().manual_seed(0), ["first", "second"], count, folder, identity)
 
 
 def test_a_stage_that_was_kept_is_read_and_not_done_again(tmp_path):
@@ -46,19 +46,17 @@ def test_a_stage_that_was_kept_is_read_and_not_done_again(tmp_path):
     first = one.run("first", Found, work)
     two = kept(tmp_path / "kept", work=again)
     read = two.run("first", Found, again)
-    assert (work.count, again.count) == (1, 0) and first is not None and read is not None and read.inner is not None
+    assert (work.count, again.count) == (1, 0) and read.inner is not None
     assert torch.equal(first.vector, read.vector) and read.error == inf and read.names == {"a": 0.1}
     assert read.inner.vector.dtype == torch.float32 and read.parts[0].shape == (2, 3)
     assert two.notes == one.notes == ["a note"] and two.counts == one.counts == [1]
     assert kept_stages(tmp_path / "kept") == ["first"]
     second = two.run("second", Found, again)  # as if nothing had been kept
-    assert second is not None and torch.equal(second.vector, _alone("second").vector)
+    assert torch.equal(second.vector, _alone("second").vector)
 
 
 def _alone(name) -> Found:
-    found = kept(None).run(name, Found, Work())
-    assert found is not None
-    return found
+    return kept(None).run(name, Found, Work())
 
 
 @pytest.mark.parametrize("harm", ["another command", "cut", "one bit", "another type"])
@@ -76,18 +74,3 @@ def test_what_is_not_this_command_s_is_measured_again(tmp_path, harm):
         return
     kept(tmp_path, identity="that" if harm == "another command" else "this").run("first", Found, work)
     assert work.count == 1
-
-
-def test_time_that_ends_gives_a_stage_up_and_begins_no_other(tmp_path):
-    work = Work()
-    late = kept(tmp_path, deadline=0.0)
-    assert late.run("first", Found, work) is None and work.count == 0 and late.unreached == ["first"]
-    assert late.run("second", Found, work, ends_in_time=True) is not None and not kept_stages(tmp_path)
-
-    def slow(generator, report, notes):
-        soon.deadline = 0.0
-        report(1, 2, "half")
-        pytest.fail("it went on")
-
-    soon = kept(tmp_path)
-    assert soon.run("first", Found, slow) is None and soon.unreached == ["first"]

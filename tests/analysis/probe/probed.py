@@ -11,5 +11,5 @@ SCENE = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
 
 def unlimited(checkpoint: Path, out: Path, *options: str) -> Record:
     """A probe whose numbers depend on no clock, with a slice of few points."""
-    assert main(["probe", str(checkpoint), "--out", str(out), "--seconds", "inf", "--slice-points", "5", *options]) == 0
+    assert main(["probe", str(checkpoint), "--out", str(out), "--slice-points", "5", *options]) == 0
     return read_record(out)

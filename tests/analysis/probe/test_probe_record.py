@@ -74,7 +74,7 @@ def test_a_checkpoint_can_be_probed_with_the_loss_of_3dgs(run, tmp_path, no_pict
     other = replace(loaded.training, config=replace(loaded.training.config, loss=LossSettings("l2", literal=True)))
     for name, training, options in (("plain", loaded.training, []), ("other", other, ["--loss", "3dgs"])):
         save_checkpoint(run / f"{name}.pt", training, loaded.scene)
-        words = ["probe", str(run / f"{name}.pt"), "--quick", "--seconds", "inf", "--out", str(tmp_path / name)]
+        words = ["probe", str(run / f"{name}.pt"), "--quick", "--out", str(tmp_path / name)]
         assert main([*words, *options]) == 0
     plain, probed = (read_record(tmp_path / name, ProbeRecord).data for name in ("plain", "other"))
     assert probed.objective == plain.objective and probed.traces == plain.traces
@@ -133,25 +133,6 @@ def test_a_quick_probe_leaves_out_the_same_pictures_however_it_is_started(run, t
     )
     assert run_probe(ProbeOptions(run / "checkpoint.pt", quick=True, out=tmp_path / "function")) == 0
     assert begun == drawn == [("make_all",)]
-
-
-def test_time_that_ends_is_said_and_the_same_command_continues_to_the_same_numbers(
-    run, record, tmp_path, capsys, no_pictures
-):
-    out = tmp_path / "short"
-    words = ["probe", str(run / "double.pt"), "--out", str(out), "--slice-points", "5"]
-    assert main([*words, "--seconds", "1e-6"]) == 0
-    data, said = read_record(out).data, " ".join(capsys.readouterr().out.split())
-    assert data.eigenvalues.max.reason == "time budget" and data.slice is None and data.depth is None
-    assert any("time ended before: renders, slice, density, finite probe, depth" in note for note in data.notes)
-    assert data.anisotropy.top_mass.value is None
-    # what is not known is no number, and the command that resolves it is named
-    assert "steepest – (not reached)" in said and "λ max" not in said
-    assert f"landscape probe {run / 'double.pt'} --out {out} --slice-points 5" in said
-    assert main(words) == 0
-    again, whole = numbers(read_record(out)), numbers(record)
-    assert again[1] == whole[1] and again[0]["eigenvalues"] == whole[0]["eigenvalues"]
-    assert not list(tmp_path.glob(".short.unfinished"))
 
 
 def test_the_summary_says_of_both_ends_what_renders_say_and_who_carries_them(record, dense):

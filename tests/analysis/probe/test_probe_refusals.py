@@ -49,7 +49,6 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys):
         capsys, [str(path), "--scene", str(tmp_path / "other")], f"the training's scene still in {tmp_path / 'other'}"
     )
     refused(capsys, [str(path), "--slice-points", "4"], "odd number")
-    refused(capsys, [str(path), "--seconds", "0"], "seconds")
     (copy / "probe").mkdir()
     (copy / "probe" / "thesis.txt").write_text("years of work")
     refused(capsys, [str(path), "--scene", str(tmp_path / "scene")], "older record to replace", "move it away")

@@ -109,8 +109,8 @@ def test_the_findings_say_where_a_budget_ended_the_search_for_an_end():
     data, _ = synthetic()
     data["eigenvalues"]["min"] |= {"reason": "tolerance"}
     assert "farther out" not in sentences(data)
-    data["eigenvalues"]["min"] |= {"reason": "time budget"}
-    assert "The search for the smallest eigenvalue ended at its time budget" in sentences(data, "caution")
+    data["eigenvalues"]["min"] |= {"reason": "matvec budget"}
+    assert "The search for the smallest eigenvalue ended at its matvec budget" in sentences(data, "caution")
     data["eigenvalues"]["max"] |= {"reason": "matvec budget"}
     assert "The search for the largest eigenvalue ended at its matvec budget" in sentences(data, "caution")
 

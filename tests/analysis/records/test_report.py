@@ -314,9 +314,8 @@ def test_a_failed_check_comes_first_and_in_red(tmp_path):
 @pytest.mark.parametrize(
     ("index", "settings", "reason", "command"),
     [
-        ("top_mass", {"density_matvecs": 108}, "tolerance", "landscape probe run --out there --density-products 432"),
-        ("eigenvalue_ratio", {}, "time budget", "landscape probe run --out there"),
-        ("eigenvalue_ratio", {}, "matvec budget", "landscape probe run --out there --end-products 60"),
+        ("top_mass", {"density_matvecs": 108}, "tolerance", "run --end-products 15 --density-products 432"),
+        ("eigenvalue_ratio", {}, "matvec budget", "run --density-products 9 --end-products 60"),
         ("eigenvalue_ratio", {}, "noise floor", None),
     ],
 )
@@ -328,7 +327,7 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     data["eigenvalues"]["min"] |= {"reason": reason, "matvecs": 15}
     asked = {f"settings.{name}": value for name, value in settings.items()}
     data["provenance"] |= {"fingerprint": plain(Fingerprint({}, asked, "00"))}
-    data["provenance"] |= {"command": "landscape probe run --seconds 45 --out there"}
+    data["provenance"] |= {"command": "landscape probe run --end-products 15 --density-products 9"}
     (line,) = (line for line in findings(probe_of(data)) if line.level == "open")
     assert line.text.startswith(f"{index.replace('_', ' ').capitalize()}: – (at least 0.500); ")
     assert line.text.endswith(f"{command}." if command else "no more products resolve it.")

@@ -325,7 +325,7 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         f"The probes are of versions {FORMULAS}, {FORMULAS + 1} of the formulas: probe again.",
         "sam/0: The check of symmetry failed",
         "sam/0: It was not scored.",
-        "plain/0: The search for the smallest eigenvalue ended at its time budget: it may lie farther out. So it is",
+        "plain/0: The search for the smallest eigenvalue ended at its matvec budget: it may lie farther out. So it is",
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",
     ):
         assert part in said

@@ -41,11 +41,11 @@ def test_searches_that_ran_out_are_said_with_their_cells(tmp_path):
         (cell.out / "metrics.json").write_text(json.dumps({"test": {}, "train": {}, "gaussians": 9}))
     shutil.rmtree(cells[2].out / "probe")
     rows = results(cells, {cell.name: "done" for cell in cells})
-    assert rows["lambda_min_reason"].tolist()[:2] == ["time budget"] * 2
+    assert rows["lambda_min_reason"].tolist()[:2] == ["matvec budget"] * 2
     assert rows["lambda_max_reason"].tolist()[:2] == ["tolerance", "noise floor"]
     (line,) = unfinished(rows)
     assert line.startswith(
-        "still/3dgs/0, still/3dgs/1: The search for the smallest eigenvalue ended at its time budget"
+        "still/3dgs/0, still/3dgs/1: The search for the smallest eigenvalue ended at its matvec budget"
     )
     assert "lambda_min_n" in summarize(rows) and not [name for name in summarize(rows) if "reason" in name]
     assert unfinished(rows.drop(columns=list(REASONS))) == []
