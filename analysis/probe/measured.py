@@ -66,7 +66,7 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Results of all stages; rendered, density, power, finite, depth and plane are None where a note says why.
+    """Results of all stages; rendered, density, power, depth and plane are None where a note says why.
 
     matvecs: products H v of all stages; spared: products of single views, known to be 0 and left out; rank: number of
     directions that are not exactly flat; spreads: see `Search`; left_out: of training views, if any were.
@@ -81,7 +81,6 @@ class Measured:
     spreads: tuple[list[tuple[float, float]], list[tuple[float, float]]]
     power: EigenEnds | None
     density: SpectralDensity | None
-    finite: FiniteProbe | None
     depth: Depth | None
     plane: PlaneSlice | None
     rendered: Rendered | None

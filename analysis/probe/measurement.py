@@ -11,7 +11,6 @@
     slice               the loss over the plane of the first two eigenvectors: rendered where needed, interpolated elsewhere
     density *           stochastic Lanczos quadrature, for sums of |lambda|; the Krylov spaces of its first runs
                         contain the iterates of the paper's power iteration
-    finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
     depth *             the positions' gradient and curvature along the rays and across them, and finite steps both ways
 
 * not in a quick probe.  Estimators stop at their accuracy or at a limit on products; their results say which.  Numbers depend
@@ -59,7 +58,7 @@ from landscape.operators.distributed import ALONE, DistributedOperator, Ranks
 from landscape.operators.operator import LiftedOperator
 from landscape.probes import spawn
 from landscape.results import Progress
-from landscape.slices.finite_probe import FiniteProbe, finite_probe
+from landscape.slices.finite_probe import finite_probe
 from landscape.slices.grid_evaluations import Loss
 from landscape.slices.refinement import SliceSettings
 from landscape.spectrum.density import ActiveSpace
@@ -73,10 +72,9 @@ from splat.model.gaussians import Gaussians
 from splat.render.backend import CPU, backend_of
 
 # each stage has random numbers of its own; "": those of stages that are gone, so that the others keep theirs
-STREAMS = ("traces", "eigenvalues", "slice", "density", "", "finite probe", "depth", "", "renders")
+STREAMS = ("traces", "eigenvalues", "slice", "density", "", "", "depth", "", "renders")
 LEFT_OUT = {  # notes on stages that the settings exclude
     "density": "the spectral density was left out, and the indices that need it",
-    "finite probe": "the finite probe was left out",
     "depth": "positions along and across the rays were left out",
 }
 # steps of renders along the ends: change of the loss by the longest, at most; from the optimiser's step to the shortest (three
@@ -161,16 +159,14 @@ def _all_stages(
     ends = search.ends
     rendered = kept.run("renders", Rendered, partial(_rendered, at, ends, steps))
     plane = kept.run("slice", PlaneSlice | None, partial(_plane, at, ends))  # pyright: ignore[reportArgumentType]
-    spectrum = finite = depth = None
+    spectrum = depth = None
     if settings.density_matvecs:
         spectrum = kept.run("density", Spectrum, partial(_spectrum, at, ends, traces))
-    if settings.probe_steps:
-        finite = kept.run("finite probe", FiniteProbe, partial(_finite, at, ends))
     if settings.depth is not None:
         depth = kept.run("depth", Depth, partial(_depth, at, settings.depth))
     matvecs, spared = (sum(both) for both in zip(of_checks, kept.counts, strict=True))
     spared = int(at.ranks.sum(torch.tensor(spared)))
-    wanted = {"density": settings.density_matvecs, "finite probe": settings.probe_steps, "depth": settings.depth}
+    wanted = {"density": settings.density_matvecs, "depth": settings.depth}
     return Measured(
         value=at.value,
         gradient_norm=float(at.gradient.double().norm()),
@@ -181,7 +177,6 @@ def _all_stages(
         spreads=search.spreads,
         power=spectrum and spectrum.power,
         density=spectrum and spectrum.density,
-        finite=finite,
         depth=depth,
         plane=plane,
         rendered=rendered,
@@ -269,13 +264,6 @@ def _spectrum(
         active=active, ends=ends, trace=total_trace(traces), watch=watch,
     )  # fmt: skip
     return Spectrum(density, iterates[0] if iterates else None)
-
-
-def _finite(at: _Point, ends: EigenEnds, _: torch.Generator, report: Progress, __: list[str]) -> FiniteProbe:
-    """Second differences of the loss along the first eigenvector."""
-    center, vector = at.objective.active.flat, ends.largest.vectors[:, 0]
-    steps, points = at.settings.probe_steps, at.settings.noise_points
-    return finite_probe(at.objective.evaluate, center, vector, at.operator, steps, report, points)
 
 
 def _rendered(

@@ -48,6 +48,5 @@ def expected_seconds(settings: ProbeSettings, render: float, further: float = 0.
     renders += 70  # along these
     renders += 0.75 * min(POINTS, settings.slice_points**2) if settings.slice_plane else 1.5 * settings.slice_points
     products += 0.3 * settings.density_matvecs
-    renders += 2 * len(settings.probe_steps) + settings.noise_points + 1 if settings.probe_steps else 0
     products, renders = (products, renders) if settings.depth is None else (products + 3, renders + 60)
     return (PRODUCT * products + renders) * render + (PICTURES if settings.slice_plane else QUICK_PICTURES)

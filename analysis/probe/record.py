@@ -41,7 +41,6 @@ def probe_record(
         eigenvalues=_eigenvalues(found, objective),
         anisotropy=anisotropy_record(found.ends, found.density, found.power),
         concentration=concentration_record(found.density),
-        finite_probe=found.finite and finite_record(found.finite),
         depth=found.depth,
         step_rises=UNSET if found.rendered is None else found.rendered.rises,
         slice=found.plane and slice_record(found.plane, found.ends.largest),
@@ -187,11 +186,6 @@ def paper_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
     if certain.note not in ("definite", "indefinite"):
         note += f" ({certain.note})"
     return index_of(replace(certain, value=value, note=note))
-
-
-def finite_record(probe: FiniteProbe) -> schema.FiniteProbe:
-    """Along the first eigenvector."""
-    return convert({**probe.record(), "direction": NAMES[0]}, schema.FiniteProbe)
 
 
 def slice_record(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:

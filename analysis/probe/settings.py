@@ -6,7 +6,6 @@ from analysis.measures.depth import STEPS as DEPTH_STEPS
 from analysis.measures.gradient_check import FEW
 from landscape import EigenSettings, PowerSettings, TraceSettings
 from landscape.errors import InputError
-from landscape.slices.finite_probe import NOISE_POINTS, STEPS
 
 FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density's run and along a side of a slice
 FEWEST_PRODUCTS = 16  # of a density
@@ -24,8 +23,6 @@ class ProbeSettings:
     slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
         of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
         slice_plane: whether to render more than its two axes.
-    probe_steps: of the finite probe, units of the parameters; (): left out.  noise_points: renders from which it tells the
-        noise of a render.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
     memory: GiB for the vectors of a basis.
     """
@@ -42,10 +39,8 @@ class ProbeSettings:
     slice_rise: float = 0.001
     slice_tolerance: float = 0.01
     slice_plane: bool = True
-    probe_steps: tuple[float, ...] = STEPS
     depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=1024))
     depth_steps: tuple[float, ...] = DEPTH_STEPS
-    noise_points: int = NOISE_POINTS
     memory: float = 2.0
 
     def __post_init__(self) -> None:
@@ -70,6 +65,5 @@ class ProbeSettings:
             density_matvecs=0,
             slice_points=21,
             slice_plane=False,
-            probe_steps=(),
             depth=None,
         )

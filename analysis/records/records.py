@@ -108,7 +108,7 @@ BOTH_ENDS = ("eigenvalue_ratio", "negative_ratio")
 class ProbeRecord(Struct, kw_only=True):
     """Results of `landscape probe`.
 
-    traces: by attribute (means, log_scales, quats, opacity_logits, sh).  finite_probe, depth, slice: None where left out.
+    traces: by attribute (means, log_scales, quats, opacity_logits, sh).  depth, slice: None where left out.
     steps: length of the optimiser's first step in a parameter, by attribute.  step_rises: of the loss in such steps with random
     signs, rendered, with its error (`analysis.measures.units`).  measures: those of `analysis.probe.measures`, each with its
     error.  skipped: by the kind of work.  checks: symmetry, round_off, finiteness, finite_difference.  timing: stage ->
@@ -126,7 +126,6 @@ class ProbeRecord(Struct, kw_only=True):
     eigenvalues: schema.Eigenvalues
     anisotropy: schema.Anisotropy
     concentration: Maybe[schema.Concentration] = UNSET
-    finite_probe: schema.FiniteProbe | None = None
     depth: schema.Depth | None = None
     steps: Maybe[dict[str, float]] = UNSET
     step_rises: Maybe[dict[str, tuple[float, float]]] = UNSET

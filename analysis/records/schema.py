@@ -253,7 +253,6 @@ class FiniteProbe(Struct, kw_only=True):
     evaluations: renders of all views.
     """
 
-    direction: Maybe[str] = UNSET
     steps: Annotated[list[float], Meta(min_length=1)]
     curvatures: list[Number]
     round_off: list[Number]

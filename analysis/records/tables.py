@@ -1,6 +1,5 @@
 """Tables of a probe's record: all numbers, for the report; the anisotropy families, for the terminal and the report."""
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,7 +9,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from analysis.records.findings import attribute_name, is_open, is_wide, resolved
+from analysis.records.findings import attribute_name, is_open, is_wide
 from analysis.records.quantities import (
     HARD,
     PLUS_MINUS,
@@ -23,7 +22,7 @@ from analysis.records.quantities import (
     rough,
 )
 from analysis.records.records import Check, Counts, ProbeRecord
-from analysis.records.schema import INDICES, BlockAnisotropy, Depth, Effect, End, FiniteProbe, Index, Number
+from analysis.records.schema import INDICES, BlockAnisotropy, Depth, Effect, End, Index, Number
 
 ENDS = {
     "max": "largest eigenvalue",
@@ -54,7 +53,6 @@ def number_rows(data: ProbeRecord) -> dict[str, list[Row]]:
         "Curvature by attribute": _trace_rows(data),
         "Extreme eigenvalues": _end_rows(data),
         "Anisotropy": _index_rows(data),
-        "Finite steps along e₁": _finite_rows(data.finite_probe),
         "Positions along and across the rays": _depth_rows(data.depth),
         "Beyond derivatives at the training views": _measure_rows(data.measures or {}),
         "Sizes": _count_rows(data.counts),
@@ -109,20 +107,6 @@ def _check_rows(checks: Mapping[str, Check]) -> Iterator[Row]:
         outcome = {None: "could not run", True: "passed", False: "FAILED"}[check.passed]
         note = f" ({check.note})" if check.note else ""
         yield (name.replace("_", " "), quantity(check.value), f"{outcome}, at most {quantity(check.bound)}{note}")
-
-
-def _finite_rows(probe: FiniteProbe | None) -> Iterator[Row]:
-    """Rows of the second differences, at the steps where round-off does not hide them; the others are counted."""
-    if probe is not None:
-        if probe.infinitesimal is not None:
-            yield "curvature at 0 (infinitesimal)", quantity(probe.infinitesimal), ""
-        columns = probe.steps, probe.curvatures, probe.round_off, probe.truncation, resolved(probe)
-        for step, value, rounded, truncated, sure in zip(*columns, strict=True):
-            if sure:
-                error = math.hypot(*(math.inf if each is None else each for each in (rounded, truncated)))
-                yield f"curvature at ±{quantity(step)}", measured(value, error), ""
-        if hidden := [quantity(step) for step, sure in zip(probe.steps, resolved(probe), strict=True) if not sure]:
-            yield "hidden by round-off", f"{len(hidden)} steps", f"±{', ±'.join(hidden)}"
 
 
 def _reason(reason: str | None) -> str:

@@ -15,8 +15,8 @@
     one_gaussian                share of the steepest eigenvector's squared mass on a single Gaussian
     INDEX_scene, INDEX_optimiser   the indices in units of the scene's size or of the optimiser's steps, where the families were
                                 measured in these
-    finite_curvature            second difference along the steepest eigenvector, at the step nearest to Adam's first: the root
-                                mean square of its attributes' learning rates, weighted with its mass
+    finite_curvature            second difference along the steepest eigenvector, at a step as long as Adam's first with random
+                                signs has along it
     opacity_one_view            rank correlation of a Gaussian's curvature in opacity with the share of its weight that one view
                                 sees; where `landscape map` has been run
     hutchinson_ATTRIBUTE, hutchinson_ATTRIBUTE_most   the least and the largest relative standard error that ten Gaussian
@@ -25,9 +25,9 @@
 A number that a run does not have is empty.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
-from math import log, nan, sqrt
+from math import nan, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,6 @@ import pandas as pd
 from msgspec import structs
 
 from analysis.console.overrides import overridden
-from analysis.measures.units import step_lengths
 from analysis.records.provenance import require_own
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS, Made, MapRecord, read_map, read_scores
@@ -47,7 +46,7 @@ from splat.model.typed import leaves
 from splat.training.checkpoint import load_checkpoint
 from splat.training.methods.protocols import presets
 from splat.training.start import Source
-from splat.training.state import LearningRates, TrainConfig
+from splat.training.state import TrainConfig
 
 SAMPLES = 10  # the paper's B
 
@@ -109,7 +108,7 @@ def row_of(run: Path) -> dict[str, Any]:
         return row
     data = read_record(run / PROBE, ProbeRecord).data
     require_own(data.provenance.fingerprint, state, run / PROBE / ProbeRecord.FILE, "probe again")
-    return row | probe_of(run) | _more(data, config.rates, checkpoint.training.extent)
+    return row | probe_of(run) | _more(data)
 
 
 def _of_map(run: Path, state: str) -> dict[str, float]:
@@ -158,32 +157,22 @@ def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _more(data: ProbeRecord, rates: LearningRates, extent: float) -> dict[str, float]:
+def _more(data: ProbeRecord) -> dict[str, float]:
     """Columns for statements and predictors in addition to those of a sweep."""
     second, lives = data.eigenvalues.second, data.eigenvalues.max.lives_on
     row = {"lambda_second": _number(second and second.value)}
+    if (renders := data.eigenvalues.max.renders) and (ratio := renders.at_step) is not None:
+        row["finite_curvature"] = ratio * _number(data.eigenvalues.max.value)
     if data.depth:
         row["depth_gradient"] = _number(data.depth.gradient_ratio)
     if lives:
         row |= {"needles": lives.needles, "needle_count": lives.needle_count / max(data.counts.visible_gaussians, 1)}
         row |= {"one_gaussian": lives.heaviest[0][1] if lives.heaviest else nan}
-        row |= _finite(data, lives.attributes, rates, extent)
     for family in data.per_attribute or ():
         if (family.operator, family.block, family.split) == ("hessian", "all", False) and family.metric != "parameters":
             indices = {name: index for name, index in structs.asdict(family.indices).items() if index}
             row |= {f"{name}_{family.metric}": _number(index.value) for name, index in indices.items()}
     return row | _hutchinson(data)
-
-
-def _finite(data: ProbeRecord, shares: Mapping[str, float], rates: LearningRates, extent: float) -> dict[str, float]:
-    """The second difference at the step nearest in length to Adam's first, along a vector with these shares of attributes."""
-    if not data.finite_probe:
-        return {}
-    lengths = step_lengths(rates, extent)
-    length = sqrt(sum(share * lengths[name] ** 2 for name, share in shares.items()))
-    steps, curvatures = data.finite_probe.steps, data.finite_probe.curvatures
-    nearest = min(range(len(steps)), key=lambda i: abs(log(steps[i] / length)))
-    return {"finite_curvature": _number(curvatures[nearest])}
 
 
 def _hutchinson(data: ProbeRecord) -> dict[str, float]:

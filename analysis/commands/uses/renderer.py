@@ -130,7 +130,6 @@ def _measured(hessian: RendererHessian, options: ProbeOptions, stages: Stages) -
         eigenvalues=schema.Eigenvalues(max=rows[0], second=rows[1], min=rows[2]),
         anisotropy=record.anisotropy_record(ends, density),
         concentration=record.concentration_record(density),
-        finite_probe=probes[0] and record.finite_record(probes[0]),
         slice=plane and record.slice_record(plane, ends.largest),
         counts=Counts(
             gaussians=0, visible_gaussians=0, parameters=hessian.dim, active_parameters=hessian.dim, sh_degree_stored=0,

@@ -83,7 +83,7 @@ def test_the_paper_s_power_iteration_is_read_from_the_density_without_products()
     )
     seen = []
     settings = replace(
-        ProbeSettings(), slice_points=5, traces=TraceSettings(rtol=0.3), probe_steps=(), depth=None, density_matvecs=48
+        ProbeSettings(), slice_points=5, traces=TraceSettings(rtol=0.3), depth=None, density_matvecs=48
     )
     draw = measurement.spectral_density
 

@@ -120,15 +120,6 @@ def test_the_eigenvectors_are_said_to_live_where_the_dense_ones_do(record, dense
         assert share == pytest.approx(float(mass.max()), rel=1e-2)
 
 
-def test_the_finite_probe_meets_the_curvature_where_nothing_is_crossed(record):
-    probe = record.data.finite_probe
-    assert probe.infinitesimal == pytest.approx(record.data.eigenvalues.max.value, rel=1e-5)
-    best = probe.best
-    bound = probe.round_off[best] + probe.truncation[best]
-    assert not probe.crossed[best]
-    assert abs(probe.curvatures[best] - probe.infinitesimal) <= bound < 0.1 * probe.infinitesimal
-
-
 def test_positions_are_split_along_and_across_the_rays(record, dense):
     found, objective = record.data.depth, dense[0]
     split = depth_split(objective, torch.Generator().manual_seed(1))

@@ -106,7 +106,6 @@ def test_a_quick_probe_says_what_it_left_out_and_the_files_to_open(run, capsys, 
     # what it left out is said, in the record and in the report
     words = f"no surface is drawn; landscape slice {run / 'checkpoint.pt'} renders more"
     assert any(words in line.text for line in findings(data))
-    assert data.finite_probe is None and "the finite probe was left out" in data.notes
     assert data.depth is None and "positions along and across the rays were left out" in data.notes
     assert data.anisotropy.top_mass.value is None and "density" not in data.timing
     assert "the spectral density was left out, and the indices that need it" in data.notes
