@@ -68,7 +68,7 @@ class LeftOut:
 class Measured:
     """Results of all stages; rendered, density, power, depth and plane are None where a note says why.
 
-    matvecs: products H v of all stages; spared: products of single views, known to be 0 and left out; rank: number of
+    matvecs: products H v of all stages; rank: number of
     directions that are not exactly flat; spreads: see `Search`; left_out: of training views, if any were.
     """
 
@@ -85,7 +85,6 @@ class Measured:
     plane: PlaneSlice | None
     rendered: Rendered | None
     matvecs: int
-    spared: int
     rank: int
     notes: tuple[str, ...]
     left_out: LeftOut | None = None

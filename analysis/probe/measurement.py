@@ -125,11 +125,10 @@ class _Point:
     settings: ProbeSettings
     gradient: Tensor
     value: float
-    ranks: Ranks
 
     def work(self) -> list[int]:
-        """Products H v so far, and products of single views that were known to be 0 and left out."""
-        return [self.operator.matvecs, self.hessian.views.spared]
+        """Products H v so far."""
+        return [self.operator.matvecs]
 
 
 def _linearised(objective: SceneObjective, settings: ProbeSettings, ranks: Ranks, report: Progress) -> _Point:
@@ -140,7 +139,7 @@ def _linearised(objective: SceneObjective, settings: ProbeSettings, ranks: Ranks
     gradient = objective.gradient
     report(1, 1, views)
     value = objective.loss(objective.active.flat)
-    return _Point(objective, hessian, CountingOperator(operator), settings, gradient, value, ranks)
+    return _Point(objective, hessian, CountingOperator(operator), settings, gradient, value)
 
 
 def _all_stages(
@@ -164,8 +163,6 @@ def _all_stages(
         spectrum = kept.run("density", Spectrum, partial(_spectrum, at, ends, traces))
     if settings.depth is not None:
         depth = kept.run("depth", Depth, partial(_depth, at, settings.depth))
-    matvecs, spared = (sum(both) for both in zip(of_checks, kept.counts, strict=True))
-    spared = int(at.ranks.sum(torch.tensor(spared)))
     wanted = {"density": settings.density_matvecs, "depth": settings.depth}
     return Measured(
         value=at.value,
@@ -180,8 +177,7 @@ def _all_stages(
         depth=depth,
         plane=plane,
         rendered=rendered,
-        matvecs=matvecs,
-        spared=spared,
+        matvecs=of_checks[0] + kept.counts[0],
         rank=at.hessian.rank,
         notes=(*(LEFT_OUT[name] for name, each in wanted.items() if not each), *kept.notes),
         left_out=None if population is None else _left_out(at, ends, population),

@@ -14,7 +14,7 @@ from analysis.probe.settings import TEN
 from analysis.records import schema
 from analysis.records.provenance import Provenance
 from analysis.records.quantities import quantity
-from analysis.records.records import Check, Counts, ProbeRecord, Skip, counts_of, objective_of
+from analysis.records.records import Check, Counts, ProbeRecord, counts_of, objective_of
 from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, eigenvalue_ratio
 from landscape.results import Bracket, finite_or_none, sampling_error
@@ -47,7 +47,6 @@ def probe_record(
         counts=_counts(found, objective),
         checks=_checks(found, objective.counts.views),
         notes=[*found.notes, *left_out_note(objective.counts.views, left_out and left_out.population)],
-        skipped=_skipped(found, objective),
         provenance=made,
         timing=dict(timing),
     )
@@ -214,25 +213,6 @@ def _counts(found: Measured, objective: SceneObjective) -> Counts:
         products=found.matvecs,
         renders=evaluations * objective.counts.views,
     )
-
-
-def _skipped(found: Measured, objective: SceneObjective) -> dict[str, Skip]:
-    """Work that products of the exact Hessian skip, over all views, and that estimators did not need.
-
-    Not counted: tiles that a product on the GPU skips because its vectors change nothing in them.
-    """
-    counts, probes = objective.counts, [trace.probes for trace in found.traces.values()]
-    skipped = {
-        "gaussians_out_of_sight": counts.gaussians - counts.visible_gaussians,
-        "sh_bands_not_in_use": (counts.sh_degree_stored + 1) ** 2 - (counts.sh_degree_active + 1) ** 2,
-        "entries_behind_opaque_fronts": sum(view.intersections_behind for view in objective.linearized),
-        "tiles_of_zero_cotangent": sum(view.dark_tiles for view in objective.linearized),
-        "products_of_views_not_concerned": found.spared,
-        "samples_of_finished_traces": sum(max(probes) - count for count in probes),
-    }
-    if found.plane is not None:
-        skipped["points_of_the_slice_predicted"] = int((~found.plane.slice.evaluated).sum())
-    return {name: Skip(count=count) for name, count in skipped.items()}
 
 
 def _checks(found: Measured, views: int) -> dict[str, Check]:

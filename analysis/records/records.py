@@ -93,12 +93,6 @@ class Check(Struct, kw_only=True):
     note: Maybe[str] = UNSET
 
 
-class Skip(Struct, kw_only=True):
-    """Work that was not needed."""
-
-    count: Count
-
-
 Shapes = dict[str, dict[str, list[Count]]]
 
 
@@ -111,7 +105,7 @@ class ProbeRecord(Struct, kw_only=True):
     traces: by attribute (means, log_scales, quats, opacity_logits, sh).  depth, slice: None where left out.
     steps: length of the optimiser's first step in a parameter, by attribute.  step_rises: of the loss in such steps with random
     signs, rendered, with its error (`analysis.measures.units`).  measures: those of `analysis.probe.measures`, each with its
-    error.  skipped: by the kind of work.  checks: symmetry, round_off, finiteness, finite_difference.  timing: stage ->
+    error.  checks: symmetry, round_off, finiteness, finite_difference.  timing: stage ->
     seconds, in the order run, and "total".  notes: sentences on what was skipped, capped, or not reached.  arrays: group ->
     name -> shape.
     """
@@ -134,7 +128,6 @@ class ProbeRecord(Struct, kw_only=True):
     counts: Counts
     checks: dict[str, Check]
     notes: list[str] = []
-    skipped: dict[str, Skip] = {}
     provenance: Provenance
     per_attribute: Maybe[list[schema.BlockAnisotropy]] = UNSET
     split_control: Maybe[schema.SplitControl] = UNSET

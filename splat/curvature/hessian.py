@@ -22,8 +22,6 @@ class ViewSum:
 
     indices: of the views that are summed; all by default.  ssim_window: False for the pixel-diagonal of the losses' l'' in
     place of l''.
-    spared: number of products of a view with a vector that were skipped so far, because the vector moves no Gaussian that the
-    view draws (on a CPU).
     """
 
     def __init__(
@@ -37,7 +35,6 @@ class ViewSum:
         self.objective, self.gauss_newton, self.ssim_window = objective, gauss_newton, ssim_window
         self.indices = range(len(objective.views)) if indices is None else indices
         self.dim, self.dtype, self.blocks = objective.active.flat.numel(), objective.active.flat.dtype, objective.blocks
-        self.spared = 0
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         require_vectors(V, self.dim, self.dtype)
@@ -48,8 +45,6 @@ class ViewSum:
             for part, total in zip(parts, totals, strict=True):
                 if view.affects(part):
                     product(part, total, ssim_window=self.ssim_window)
-                else:
-                    self.spared += part.shape[1]
         return torch.cat(totals, dim=1) if len(totals) > 1 else totals[0]
 
     def forms(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:

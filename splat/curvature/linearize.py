@@ -103,11 +103,6 @@ class LinearizedView:
         return self._raster.intersections_reached
 
     @property
-    def intersections_behind(self) -> int:
-        """Number of (splat, tile) pairs that products skip because every pixel has stopped in front of them."""
-        return self._raster.intersections - self.intersections
-
-    @property
     def dark_tiles(self) -> int:
         """Number of tiles with splats that products skip because the loss has neither slope nor curvature there."""
         return self._raster.dark_tiles(self._adjoint, self._loss.diagonal)

@@ -139,7 +139,7 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
     template = template_environment().get_template("report.html.jinja")
     text = template.render(
         data=data,
-        counts=plain(data.counts) | {"left out": {k: v for k, v in plain(data.skipped).items() if v["count"]}},
+        counts=plain(data.counts),
         provenance=_told(data.provenance),
         subtitle=subtitle(data),
         lines=lines,

@@ -53,22 +53,6 @@ def test_the_record_has_counts_checks_stages_and_provenance(record, dense, run):
     assert all((record.folder / file).stat().st_size > 5000 for file in files)
 
 
-def test_what_was_skipped_is_counted(record, dense, run):
-    objective, _, _, _ = dense
-    skipped, gaussians = record.data.skipped, load_checkpoint(run / "double.pt").training.gaussians
-    views = list(objective.linearized)
-    most = max(trace.probes for trace in record.data.traces.values())
-    assert {name: skip.count for name, skip in skipped.items()} == {
-        "gaussians_out_of_sight": len(gaussians) - len(objective.active),
-        "sh_bands_not_in_use": 0,
-        "entries_behind_opaque_fronts": sum(view.intersections_behind for view in views),
-        "tiles_of_zero_cotangent": sum(view.dark_tiles for view in views),
-        "products_of_views_not_concerned": 0,
-        "samples_of_finished_traces": sum(most - trace.probes for trace in record.data.traces.values()),
-        "points_of_the_slice_predicted": int((~record.arrays["slice"]["evaluated"]).sum()),
-    }
-
-
 def test_a_checkpoint_can_be_probed_with_the_loss_of_3dgs(run, tmp_path, no_pictures):
     loaded = load_checkpoint(run / "double.pt")
     other = replace(loaded.training, config=replace(loaded.training.config, loss=LossSettings("l2", literal=True)))
@@ -109,8 +93,6 @@ def test_a_quick_probe_says_what_it_left_out_and_the_files_to_open(run, capsys, 
     assert data.depth is None and "positions along and across the rays were left out" in data.notes
     assert data.anisotropy.top_mass.value is None and "density" not in data.timing
     assert "the spectral density was left out, and the indices that need it" in data.notes
-    skips = data.skipped
-    assert skips["gaussians_out_of_sight"].count == data.counts.gaussians - data.counts.visible_gaussians
     rows = {name for rows in number_rows(data).values() for name, *_ in rows}
     for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
         assert f"trace of {label}" in rows

@@ -48,8 +48,6 @@ def test_two_processes_write_the_record_of_one(checkpoint, tmp_path):
     largest = [np.max(record.arrays["spectrum"]["ritz_values"]) for record in (two, one)]
     assert largest[0] == pytest.approx(largest[1], rel=1e-4)
     assert all(check.passed for check in two.data.checks.values())
-    counts = [{name: each.count for name, each in record.data.skipped.items()} for record in (two, one)]
-    assert counts[0] == counts[1]
     assert done.stdout.count("report.html") == 1  # the second process is silent
 
 

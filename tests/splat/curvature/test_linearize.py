@@ -255,17 +255,6 @@ def test_a_gaussian_that_is_not_finite_is_named():
         hold(gaussians, two_views()[0], LossSettings())
 
 
-def test_intersections_behind_opaque_fronts_are_those_that_a_view_without_stops_has_more():
-    gaussians, view, loss = random_gaussians(40, 0), two_views()[0], LossSettings()
-    gaussians.means[:4] = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)  # four walls over the whole image
-    gaussians.log_scales[:4], gaussians.opacity_logits[:4] = 3.0, 8.0
-    gaussians.means[4:, 2] = 9.0
-    held = hold(gaussians, view, loss)
-    endless = hold(gaussians, view, loss, settings=RenderSettings(transmittance_min=0.0))
-    assert held.intersections_behind > 0 == endless.intersections_behind
-    assert held.intersections + held.intersections_behind == endless.intersections
-
-
 def test_tiles_are_dark_where_the_picture_is_met_exactly_and_the_loss_does_not_couple_pixels():
     gaussians, view = random_gaussians(40, 1, logit=1.0), two_views(45, 37)[0]
     # behind the others one that fills the picture: no tile is empty, however many pixels wide the machine's registers are
