@@ -1,4 +1,4 @@
-"""Localization of a vector over a scene's parameters: its attributes, how many Gaussians, and which kind of Gaussians.
+"""Localization of a vector over a scene's parameters: its attributes, how many Gaussians, and how many needles.
 
 mass           of Gaussian i in a vector v: m_i = sum of v^2 over its parameters; shares are of sum_i m_i = |v|^2
 participation  (sum_i m_i)^2 / sum_i m_i^2: over how many Gaussians the mass is spread, 1 to n
@@ -18,8 +18,6 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.reference import NEEDLE, condition, on_screen, project
-
-HEAVIEST = 10  # Gaussians that are listed
 
 
 def mass_shares(vector: Float[Tensor, " p"], blocks: Mapping[str, slice]) -> dict[str, float]:
@@ -69,14 +67,7 @@ def conditions(
 def localize(vector: Float[Tensor, " p"], gaussians: Gaussians, conditions: Float64[Tensor, " n"]) -> LivesOn:
     """Localization of a vector laid out like `gaussians.flat`; conditions: of the same Gaussians."""
     mass = masses(vector, gaussians)
-    if len(conditions) != len(gaussians):
-        raise ValueError(f"expected conditions of {len(gaussians)} Gaussians, got {len(conditions)}")
     share, needles = mass / mass.sum(), conditions > NEEDLE
-    top = share.topk(min(HEAVIEST, len(share)))
     return LivesOn(
-        attributes=mass_shares(vector, gaussians.blocks),
-        participation=participation(mass),
-        needles=float(share[needles].sum()),
-        needle_count=int(needles.sum()),
-        heaviest=list(zip(top.indices.tolist(), top.values.tolist(), strict=True)),
+        participation=participation(mass), needles=float(share[needles].sum()), needle_count=int(needles.sum())
     )

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Literal
 
-import numpy as np
 import torch
 from msgspec import UNSET, convert, structs
 from torch import Tensor
@@ -123,14 +122,6 @@ class FamilyFindings:
         return structs.replace(
             record, per_attribute=families, split_control=control, notes=[*record.notes, *self.notes]
         )
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Nodes and weights of every density."""
-        return {
-            f"{row.scene}.{row.operator}.{row.block}.{part}": found.numpy()
-            for row in self.rows
-            for part, found in zip(("nodes", "weights"), row.family.density.table(), strict=True)
-        }
 
 
 def measure_per_attribute(

@@ -111,7 +111,7 @@ def _run(
 
             stream = spawn(generator)
             measured = measure_per_attribute(objective, checkpoint.training, families, stream, stages.stage, found.ends)
-            data, arrays["per_attribute"] = measured.added_to(data), measured.arrays()
+            data = measured.added_to(data)
         data.notes += checkpoint.assumptions
         if options.measures and folder is not None:
             from analysis.probe.measures import measures  # slow to import

@@ -104,14 +104,11 @@ def eigenvalue_record(of: EigenEnds, pairs: Eigenpairs, index: int, blocks: Mapp
 
 def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalues:
     ends, power, gaussians = found.ends, found.power, objective.active
-    numbers = objective.mask.nonzero()[:, 0]  # of the active among all
     needles = conditions(gaussians, [view.camera for view in objective.views], objective.settings)
 
     def exact(pairs: Eigenpairs, index: int) -> schema.Eigenvalue:
         found_end = eigenvalue_record(ends, pairs, index, gaussians.blocks)
         found_end.lives_on = localize(pairs.vectors[:, index], gaussians, needles)
-        heaviest = found_end.lives_on.heaviest
-        found_end.lives_on.heaviest = [(int(numbers[i]), share) for i, share in heaviest]
         return found_end
 
     largest, smallest = ends.largest, ends.smallest

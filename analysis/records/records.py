@@ -33,7 +33,6 @@ ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
     "eigenvectors": {"largest": "parameters k", "smallest": "parameters m?"},
     "traces": {"*": "probes?"},
-    "per_attribute": {"*": "starts steps?"},
     "places": {"positions": "points xyz", "curvature": "points"},
     "slice": {"x": "nx", "y": "ny?", "loss": "grid", "model": "grid?", "evaluated": "grid?", "crossed": "grid?"},
     "directions": {"vectors": "parameters d"},
@@ -45,7 +44,6 @@ spectrum      ritz_values, residuals: approximate eigenvalues, the two ends amon
 eigenvectors  unit vectors of the k largest and the m smallest eigenvalues, of the Gaussians in sight
 traces        ATTRIBUTE: the samples whose mean is the trace
 places        of another renderer: positions, and the largest eigenvalue of each one's own block of Gauss-Newton
-per_attribute SCENE.OPERATOR.BLOCK.nodes and .weights: the quadrature of each family's density
 slice         x, y: increasing steps along the directions; loss: L on the grid, [nx, ny] or, along a line, [nx]; model: the
               quadratic model there; evaluated (boolean): true where loss is rendered, false where interpolated (absent: all are
               rendered); crossed (boolean): true where the order of the splats or the set of visible ones is not that of the

@@ -103,16 +103,13 @@ class Trace(TraceOf, kw_only=True):
 class LivesOn(Struct, kw_only=True):
     """Localization of an eigenvector (`analysis.measures.localization`).
 
-    attributes: shares of the squared mass |v|^2.  participation: over how many Gaussians it is spread.  needles: share of it on
-    Gaussians with a condition number above 100; needle_count: the number of those.  heaviest: (number among all, share) of
-    Gaussians, the largest share first.
+    participation: over how many Gaussians the squared mass |v|^2 is spread.  needles: share of it on Gaussians with a condition
+    number above 100; needle_count: the number of those.
     """
 
-    attributes: dict[str, Portion] = {}
     participation: Number
     needles: Portion
     needle_count: Count
-    heaviest: list[tuple[Count, Portion]] = []
 
 
 class End(Struct, kw_only=True):

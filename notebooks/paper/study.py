@@ -163,11 +163,12 @@ def _more(data: ProbeRecord) -> dict[str, float]:
     row = {"lambda_second": _number(second and second.value)}
     if (renders := data.eigenvalues.max.renders) and (ratio := renders.at_step) is not None:
         row["finite_curvature"] = ratio * _number(data.eigenvalues.max.value)
+    if carrier := data.eigenvalues.max.carrier:
+        row["one_gaussian"] = carrier.share
     if data.depth:
         row["depth_gradient"] = _number(data.depth.gradient_ratio)
     if lives:
         row |= {"needles": lives.needles, "needle_count": lives.needle_count / max(data.counts.visible_gaussians, 1)}
-        row |= {"one_gaussian": lives.heaviest[0][1] if lives.heaviest else nan}
     for family in data.per_attribute or ():
         if (family.operator, family.block, family.split) == ("hessian", "all", False) and family.metric != "parameters":
             indices = {name: index for name, index in structs.asdict(family.indices).items() if index}

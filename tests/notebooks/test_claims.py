@@ -182,11 +182,13 @@ def test_quantities_that_most_runs_lack_are_left_out():
 def test_a_row_has_the_curvature_that_adams_steps_see(tmp_path):
     data, arrays = synthetic()
     data["eigenvalues"]["max"]["lives_on"] = {
-        "attributes": {"quats": 1.0}, "participation": 1.1, "needles": 0.9, "needle_count": 3, "heaviest": [[4, 0.8]],
+        "participation": 1.1, "needles": 0.9, "needle_count": 3,
     }  # fmt: skip
     data["eigenvalues"]["max"] |= {"value": 4.0, "renders": {
         "confirmed": False, "optimiser_step": 1e-3, "steps": [1e-4, 1e-3], "ratios": [1.0, 0.5], "errors": [0.0, 0.1],
     }}  # fmt: skip
+    carrier = {"gaussian": 4, "share": 0.8, "attribute": "quats"}
+    data["eigenvalues"]["max"]["carrier"] = carrier
     written(tmp_path / "probe", data, arrays)
     row = _more(read_record(tmp_path / "probe", ProbeRecord).data)
     assert row["finite_curvature"] == 0.5 * 4.0

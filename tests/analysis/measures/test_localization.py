@@ -54,13 +54,11 @@ def test_a_vector_on_one_needle_lives_there_alone() -> None:
     parts = gaussians.with_flat(vector)
     parts.means[1, 2], parts.sh[1, 3, 0] = 3.0, 4.0
     found = localize(vector, gaussians, conditions(gaussians, [CAMERA]))
-    assert found.participation == 1.0 and found.heaviest[0] == (1, 1.0)
-    assert found.attributes["means"] == pytest.approx(0.36) and found.attributes["sh"] == pytest.approx(0.64)
+    assert found.participation == 1.0
     assert (found.needles, found.needle_count) == (1.0, 1)
     parts.opacity_logits[:] = torch.tensor([5.0, 0.0, 0.0])
     found = localize(vector, gaussians, conditions(gaussians, [CAMERA]))
     assert found.participation == pytest.approx(2.0) and found.needles == pytest.approx(0.5)
-    assert sum(share for _, share in found.heaviest[:2]) == pytest.approx(1.0)
 
 
 def test_the_blur_hides_needles_thinner_than_a_pixel() -> None:
@@ -83,5 +81,3 @@ def test_vectors_that_do_not_fit_or_have_no_length_are_refused() -> None:
     for value in (0.0, float("nan")):
         with pytest.raises(ValueError, match="finite vector that is not zero"):
             masses(torch.full((23,), value), gaussians)
-    with pytest.raises(ValueError, match="conditions of 1 Gaussians, got 2"):
-        localize(torch.ones(23), gaussians, conditions(facing((1, 1), (1, 1)), [CAMERA]))

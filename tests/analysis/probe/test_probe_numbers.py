@@ -115,9 +115,9 @@ def test_the_eigenvectors_are_said_to_live_where_the_dense_ones_do(record, dense
         v = objective.active.with_flat(vectors[:, index])
         mass = torch.stack([part.reshape(len(v), -1).square().sum(dim=1) for part in v.attributes.values()]).sum(dim=0)
         assert where.participation == pytest.approx(float(1 / mass.square().sum()), rel=1e-2)
-        heaviest, share = where.heaviest[0]
-        assert heaviest == int(objective.mask.nonzero()[mass.argmax(), 0])
-        assert share == pytest.approx(float(mass.max()), rel=1e-2)
+        carrier = getattr(record.data.eigenvalues, name).carrier
+        assert carrier.gaussian == int(objective.mask.nonzero()[mass.argmax(), 0])
+        assert carrier.share == pytest.approx(float(mass.max()), rel=1e-2)
 
 
 def test_positions_are_split_along_and_across_the_rays(record, dense):
