@@ -6,7 +6,7 @@ Every estimator returns a frozen dataclass: each number with its error, and the 
     standard error  s / sqrt(m) of a mean over m probe vectors with the sample standard deviation s
     residual        |H v - lambda v| for a unit vector v: some eigenvalue of H is no farther than this from lambda
     reason          "tolerance" (the requested error is reached), "noise floor" (the remaining error is that of the matvec, so
-                    more work would not help), "matvec budget", "evaluation budget", "time budget", "exact" or "not asked for"
+                    more work would not help), "matvec budget", "evaluation budget", "exact" or "not asked for"
 
 `record()` of a result gives its scalars as plain Python values for JSON, with None for what is infinite or undefined.
 """
@@ -23,9 +23,7 @@ from jaxtyping import Float64
 from scipy.special import stdtrit
 from torch import Tensor
 
-StopReason = Literal[
-    "tolerance", "noise floor", "matvec budget", "evaluation budget", "time budget", "exact", "not asked for"
-]
+StopReason = Literal["tolerance", "noise floor", "matvec budget", "evaluation budget", "exact", "not asked for"]
 Sign = Literal["positive", "negative", "zero", "undetermined"]
 Number = float | None
 LINE, SHORT = 100, 60  # characters of a line, and of a list in it

@@ -2,14 +2,12 @@
 
 `extreme_eigenpairs` grows one subspace for both ends by a Lanczos recurrence (`krylov`).  A run ends when the
 reported residual of every wanted pair is at most max(rtol |lambda|, atol), or at the noise of a matvec, when the basis spans
-the whole space, or when matvecs or seconds are spent.  Where the basis spans an invariant subspace, one more step must leave
+the whole space, or when the matvecs are spent.  Where the basis spans an invariant subspace, one more step must leave
 the wanted values unchanged.
 
 Davidson's method, preconditioned by diagonal blocks, would take fewer products.  But it can miss an extreme eigenvalue that
 only the entries outside these blocks make, and converge to its neighbour; a Lanczos recurrence is not blind to them.
 """
-
-from time import monotonic
 
 import torch
 from jaxtyping import Float
@@ -49,7 +47,6 @@ def extreme_eigenpairs(
     if settings.wanted > n:
         raise InputError(f"expected at most {n} eigenpairs of an operator with {n} rows, got {settings.wanted}")
     space = Krylov(operator, generator, settings, start)
-    deadline = monotonic() + settings.max_seconds
     strictness, near, before = 1.0, False, None
     while True:
         space.expand(near)
@@ -60,7 +57,6 @@ def extreme_eigenpairs(
             progress(space.matvecs, settings.max_matvecs, ritz.state())
         # no room for a step (block), its noise (1), one product of all pairs together (1) and one of each (wanted)
         spent = space.matvecs + settings.block + settings.wanted + 2 > settings.max_matvecs
-        late = monotonic() > deadline
         # below the noise of a product no residual is asked for
         goal = Goal(strictness * settings.rtol, max(strictness * settings.atol, space.floor(ritz)))
         complete = space.size == n
@@ -71,9 +67,9 @@ def extreme_eigenpairs(
         near = ritz.near(space.seen_noise, goal)
         converged = complete or (settled and not ritz.open(goal))
         before = ritz.values[ritz.wanted]
-        if converged or spent or late:
-            ends, more = space.measured(ritz, "time budget" if late else "matvec budget", converged)
-            if not more or complete or spent or late:
+        if converged or spent:
+            ends, more = space.measured(ritz, "matvec budget", converged)
+            if not more or complete or spent:
                 return ends
             # the reported residuals miss the goal that those of the recurrence meet: halve the recurrence's goal
             strictness /= 2

@@ -34,7 +34,7 @@ class EigenSettings:
     noise: length of the random vector that is added to a warm start of unit length, so that an end to which the start is
         orthogonal is found.  A short one saves products from a good start, but the run can miss an extreme eigenvector that the
         start has no component in, and report a neighbour about rtol away.  A start of several directions avoids that.
-    max_matvecs, max_seconds: budgets of both ends together; a step that has begun when the time ends is completed.
+    max_matvecs: budget of both ends together.
     """
 
     largest: int = 1
@@ -45,7 +45,6 @@ class EigenSettings:
     block: int = 1
     noise: float = 1.0
     max_matvecs: int = 1000
-    max_seconds: float = inf
     further: int = 0
 
     def __post_init__(self) -> None:
@@ -54,10 +53,9 @@ class EigenSettings:
                 f"expected largest, smallest >= 0 (not both 0) and block >= 1, "
                 f"got {self.largest}, {self.smallest} and {self.block}"
             )
-        if not (self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and 0 < self.noise < inf):
+        if not (self.rtol >= 0 and self.atol >= 0 and 0 < self.noise < inf):
             raise InputError(
-                f"expected rtol, atol, max_seconds >= 0 and a finite noise > 0, got {self.rtol}, {self.atol}, "
-                f"{self.max_seconds} and {self.noise}"
+                f"expected rtol, atol >= 0 and a finite noise > 0, got {self.rtol}, {self.atol} and {self.noise}"
             )
         if self.basis < self.wanted + 3 * self.block:
             raise InputError(f"expected a basis of at least {self.wanted + 3 * self.block} vectors, got {self.basis}")

@@ -88,7 +88,7 @@ class Ranks:
         if not self._agree(V.shape[1], fingerprint):
             raise InputError(
                 f"expected the same vectors on every rank, got others on some (here {V.shape[1]}); seed the generators "
-                "alike, leave time budgets infinite, and run on machines of one kind"
+                "alike, and run on machines of one kind"
             )
 
     def _agree(self, *numbers: int) -> bool:

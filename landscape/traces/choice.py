@@ -40,17 +40,13 @@ EPS = torch.finfo(torch.float64).eps
 
 
 def chosen(
-    operator: SymmetricOperator,
-    generator: torch.Generator,
-    settings: TraceSettings,
-    deadline: float = inf,
-    name: str = "all",
+    operator: SymmetricOperator, generator: torch.Generator, settings: TraceSettings, name: str = "all"
 ) -> TraceEstimate:
     """The trace of an operator by the method that its first probes favour."""
     if operator.dim <= settings.min_probes:
         return by_identity(operator, settings, name, generator.device)
     keep = most_test_vectors(operator, settings)
-    run = Hutchinson(operator, {name: slice(0, operator.dim)}, generator, settings, deadline, keep=keep)
+    run = Hutchinson(operator, {name: slice(0, operator.dim)}, generator, settings, keep=keep)
     first = settings.min_probes if settings.adaptive else max(LEAST, settings.max_probes // 2)
     for estimates, ended in run.looks(first):
         estimate = estimates[name]
@@ -58,7 +54,7 @@ def chosen(
         if better == "exact":
             return by_identity(operator, settings, name, generator.device, estimate.matvecs)
         if better == "xtrace":
-            return xtrace(operator, generator, settings, deadline, name, joined(run.kept))
+            return xtrace(operator, generator, settings, name, joined(run.kept))
     return estimate
 
 

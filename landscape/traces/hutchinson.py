@@ -11,8 +11,7 @@ which tell the variance (`quadratic`).
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil, inf
-from time import monotonic
+from math import ceil
 from typing import Literal
 
 import torch
@@ -23,7 +22,7 @@ from landscape.errors import InputError
 from landscape.linalg import column_dots
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.probes import Distribution, draw_probes
-from landscape.results import Progress, StopReason
+from landscape.results import Progress
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.quadratic import FEWEST, PowerSums, mean_interval, power_sums
 
@@ -43,9 +42,9 @@ class TraceSettings:
     distribution: entries of a probe are random signs ("rademacher") or standard normal ("gaussian").
     reading, method: see `landscape.traces.trace`.
     rtol, atol: a run is done when half the width of every interval is at most max(rtol |trace|, atol).  With both 0 every
-        block takes max_probes, unless max_seconds end it.  confidence: of the interval.
+        block takes max_probes.  confidence: of the interval.
     min_probes: probes before the first look at the error.  max_probes: largest number of matvecs of a block by any method.
-    max_seconds: for all blocks together; each takes min_probes even beyond it.  batch: vectors the operator takes at once.
+    batch: vectors the operator takes at once.
     memory: GiB for the vectors that a sketch keeps; XTrace stops when it is full.
     """
 
@@ -56,7 +55,6 @@ class TraceSettings:
     confidence: float = 0.95
     min_probes: int = LEAST
     max_probes: int = 100
-    max_seconds: float = inf
     batch: int = 4
     method: Method = "auto"
     memory: float = 2.0
@@ -75,11 +73,11 @@ class TraceSettings:
                 f"expected {LEAST} <= min_probes <= max_probes and max_probes >= {self.least} with the method {self.method!r}, "
                 f"got {self.min_probes} and {self.max_probes}"
             )
-        positive = self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and self.batch >= 1 and self.memory > 0
+        positive = self.rtol >= 0 and self.atol >= 0 and self.batch >= 1 and self.memory > 0
         if not (positive and 0 < self.confidence < 1):
             raise InputError(
-                f"expected rtol, atol >= 0, confidence in (0, 1), max_seconds >= 0, batch >= 1 and memory > 0, "
-                f"got {self.rtol}, {self.atol}, {self.confidence}, {self.max_seconds}, {self.batch} and {self.memory}"
+                f"expected rtol, atol >= 0, confidence in (0, 1), batch >= 1 and memory > 0, "
+                f"got {self.rtol}, {self.atol}, {self.confidence}, {self.batch} and {self.memory}"
             )
 
     @classmethod
@@ -141,13 +139,12 @@ class Hutchinson:
         rows: Mapping[str, slice],
         generator: torch.Generator,
         settings: TraceSettings,
-        deadline: float = inf,
         known: float = 0.0,
         spent: int = 0,
         keep: int = 0,
     ) -> None:
         self.operator, self.rows, self.generator = operator, rows, generator
-        self.settings, self.deadline, self.known, self.spent, self.keep = settings, deadline, known, spent, keep
+        self.settings, self.known, self.spent, self.keep = settings, known, spent, keep
         self.samples = torch.empty(len(rows), 0, dtype=torch.float64)
         assert not known or len(rows) == 1
         self.groups: dict[str, list[PowerSums]] = {name: [] for name in rows}
@@ -175,11 +172,10 @@ class Hutchinson:
             probes = self.samples.shape[1]
             if progress:
                 progress(probes, settings.max_probes, f"trace of {', '.join(self.rows)}: {probes} probes")
-            late = monotonic() > self.deadline and probes >= settings.min_probes
-            if probes < rule.next and not late:
+            if probes < rule.next:
                 continue
-            estimates = self._estimates("time budget" if late else "matvec budget")
-            ended = late or rule.end(probes, all(found.reason == "tolerance" for found in estimates.values()))
+            estimates = self._estimates()
+            ended = rule.end(probes, all(found.reason == "tolerance" for found in estimates.values()))
             yield estimates, ended
 
     def draw(self, count: int) -> None:
@@ -203,8 +199,8 @@ class Hutchinson:
         kind = self.settings.distribution
         return {name: power_sums(Z[rows], Y[rows], kind) for name, rows in self.rows.items()}
 
-    def _estimates(self, reason: StopReason) -> dict[str, TraceEstimate]:
-        """The estimates so far.  reason: for estimates that have not reached the tolerance."""
+    def _estimates(self) -> dict[str, TraceEstimate]:
+        """The estimates so far."""
         settings, results, opened = self.settings, {}, self._open_group()
         probes = self.samples.shape[1]
         widening = WIDENING if settings.adaptive else 1.0
@@ -222,7 +218,7 @@ class Hutchinson:
                 confidence=settings.confidence,
                 probes=probes,
                 matvecs=self.spent + probes,
-                reason="tolerance" if settings.reached(value, low, high) else reason,
+                reason="tolerance" if settings.reached(value, low, high) else "matvec budget",
                 samples=samples,
             )
         return results

@@ -36,8 +36,7 @@ left out of Q and cost nothing: a matrix of low rank r is exact after s + r prod
 """
 
 from dataclasses import replace
-from math import inf, sqrt
-from time import monotonic
+from math import sqrt
 
 import torch
 from jaxtyping import Float, Float64
@@ -45,7 +44,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.linalg import column_dots, gram, is_roundoff, norm
-from landscape.operators.operator import ProjectedOperator, SymmetricOperator, product, products
+from landscape.operators.operator import ProjectedOperator, SymmetricOperator, products
 from landscape.probes import draw_probes
 from landscape.results import StopReason, t_quantile
 from landscape.traces.estimate import TraceEstimate
@@ -58,15 +57,11 @@ CONFIRMATION = 1  # test vectors between reaching the tolerance and stopping
 
 
 def hutch_plus_plus(
-    operator: SymmetricOperator,
-    generator: torch.Generator,
-    settings: TraceSettings,
-    deadline: float = inf,
-    name: str = "all",
+    operator: SymmetricOperator, generator: torch.Generator, settings: TraceSettings, name: str = "all"
 ) -> TraceEstimate:
     """The trace of an operator by Hutch++.
 
-    A third of max_probes, or of the time, goes into the sketch.  An adaptive run may use fewer probes for the rest.
+    A third of max_probes goes into the sketch.  An adaptive run may use fewer probes for the rest.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> v = torch.linspace(-1, 1, 101, dtype=torch.float64)
@@ -79,11 +74,7 @@ def hutch_plus_plus(
         return by_identity(operator, settings, name, generator.device)
     # a third of the products: the range of H, as far as random vectors show it
     sketch = draw_probes(operator.dim, settings.max_probes // 3, generator, operator.dtype, settings.distribution)
-    start, Y = monotonic(), sketch[:, :0]
-    for vectors in sketch.split(settings.batch, dim=1):
-        Y = torch.cat([Y, product(operator, vectors)], dim=1)
-        if monotonic() - start > (deadline - start) / 3:
-            break
+    Y = products(operator, sketch, settings.batch)
     Q, rank = torch.linalg.qr(Y).Q, Y.shape[1]
     # a second third: the trace within that range, exactly
     known = float((Q.double() * products(operator, Q, settings.batch).double()).sum())
@@ -91,7 +82,7 @@ def hutch_plus_plus(
     rest = ProjectedOperator(operator, lambda V: V - Q @ (Q.T @ V))
     most = settings.max_probes - 2 * rank
     probing = replace(settings, min_probes=min(settings.min_probes, most), max_probes=most, method="hutchinson")
-    run = Hutchinson(rest, {name: slice(0, operator.dim)}, generator, probing, deadline, known, 2 * rank)
+    run = Hutchinson(rest, {name: slice(0, operator.dim)}, generator, probing, known, 2 * rank)
     return replace(run.estimate()[name], method="hutch++")
 
 
@@ -99,7 +90,6 @@ def xtrace(
     operator: SymmetricOperator,
     generator: torch.Generator,
     settings: TraceSettings,
-    deadline: float = inf,
     name: str = "all",
     start: tuple[Float[Tensor, "n s"], Float[Tensor, "n s"]] | None = None,
 ) -> TraceEstimate:
@@ -136,11 +126,11 @@ def xtrace(
         samples, without = _leave_out(Omega, Y, Q, HQ, kind == "gaussian")
         value, error, spent = float(samples.mean()), _error(samples, without), count + Q.shape[1]
         half = t_quantile(count - 1, settings.confidence) * error
-        # stop at the tolerance, at a budget, or once the sketch spans the range of H
-        late, reached = monotonic() > deadline, settings.reached(value, value - half, value + half)
+        # stop at the tolerance, at the budget, or once the sketch spans the range of H
+        reached = settings.reached(value, value - half, value + half)
         complete = Q.shape[1] < count  # Q spans the range of H: its trace is that of Q^T H Q
-        if late or (reached and complete) or rule.end(count, reached):
-            reason: StopReason = "tolerance" if reached else "time budget" if late else "matvec budget"
+        if (reached and complete) or rule.end(count, reached):
+            reason: StopReason = "tolerance" if reached else "matvec budget"
             interval = value, error, value - half, value + half, settings.confidence
             return TraceEstimate(name, n, *interval, count, spent, reason, samples, "xtrace")
         # go on with more test vectors, or with the identity where that costs no more

@@ -17,7 +17,6 @@ products, and XTrace twice as many vectors more, within `TraceSettings.memory`.
 
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
-from time import monotonic
 
 import torch
 
@@ -66,22 +65,19 @@ def estimate_traces(
     unknown = [name for name in names if name not in operator.blocks]
     if unknown:
         raise InputError(f"expected blocks out of {', '.join(operator.blocks)}, got {unknown[0]!r}")
-    deadline = monotonic() + settings.max_seconds
     if settings.reading == "full":
         rows = {name: operator.blocks[name] for name in names}
-        return Hutchinson(operator, rows, spawn(generator), settings, deadline).estimate(progress)
+        return Hutchinson(operator, rows, spawn(generator), settings).estimate(progress)
     estimates: dict[str, TraceEstimate] = {}
     most = len(names) * settings.max_probes
     for index, name in enumerate(names):
         block, stream = RestrictedOperator(operator, name), spawn(generator)
         before = index * settings.max_probes
         report = progress and (lambda done, _, state, before=before: progress(before + done, most, state))
-        # the remaining time is shared evenly among the remaining blocks
-        end = monotonic() + max(deadline - monotonic(), 0) / (len(names) - index)
         if settings.method == "hutchinson":
-            estimates |= Hutchinson(block, block.blocks, stream, settings, end).estimate(report)
+            estimates |= Hutchinson(block, block.blocks, stream, settings).estimate(report)
         else:
-            estimates[name] = ESTIMATORS[settings.method](block, stream, settings, end, name)
+            estimates[name] = ESTIMATORS[settings.method](block, stream, settings, name)
             if report:
                 report(settings.max_probes, most, f"trace of {name}: {estimates[name].matvecs} matvecs")
     return estimates

@@ -18,7 +18,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from math import sqrt
-from time import monotonic
 from typing import Literal
 
 import torch
@@ -60,7 +59,7 @@ def exact_traces(
 
     By default to 1%, with 8 to 64 samples; exact where the loss does not couple pixels (ssim_weight = 0).
     gauss_newton: of the Gauss-Newton part, where T_b = C_b.  scale: (p,) positive; of S H S, S = diag(scale), instead of H.
-    settings: rtol, atol, confidence, min_probes and max_probes (of samples), and max_seconds; the rest is ignored.
+    settings: rtol, atol, confidence, min_probes and max_probes (of samples); the rest is ignored.
     samples: an exact number, at least LEAST_SAMPLES, for rough values; overrides the settings.
 
     >>> from splat import SceneObjective, SyntheticSettings, synthetic_scene
@@ -157,16 +156,14 @@ def sampled_traces(
     traces: Sequence["SampledTrace"],
     progress: Progress | None = None,
 ) -> dict[str, TraceEstimate]:
-    """Estimates of traces, sampled together until each is accurate enough or out of samples or time."""
-    start = monotonic()
+    """Estimates of traces, sampled together until each is accurate enough or out of samples."""
     while unfinished := [trace for trace in traces if trace.open]:
         count, next_check = unfinished[0].count, min(trace.rule.next for trace in unfinished)
         # few traces leave room for several samples in the pass over the pixels
         batch = min(max(COLUMNS // len(unfinished), 1), next_check - count)
         sampled = coupling_samples(objective, generator, draw, [trace.name for trace in unfinished], batch)
-        seconds = monotonic() - start
         for trace, x, y in zip(unfinished, *(part.unbind(dim=1) for part in sampled), strict=True):
-            trace.add(x, y, late=seconds > trace.settings.max_seconds)
+            trace.add(x, y)
         if progress:
             state = f"traces: {count + batch} random samples of what pairs of pixels add"
             progress(count + batch, unfinished[0].most, state)
@@ -197,20 +194,17 @@ class SampledTrace:
         self.differences: list[Float64[Tensor, "m s"]] = []  # x - y of each view
         # a run can end at `first` samples: where the tolerance holds there and CONFIRMATION samples earlier
         check = most if first == most else max(first - CONFIRMATION, LEAST_SAMPLES)
-        self.rule, self.open, self.late = StoppingRule(check, most), pixelwise is not None, False
+        self.rule, self.open = StoppingRule(check, most), pixelwise is not None
 
     @property
     def count(self) -> int:
         return len(self.x)
 
-    def add(self, x: Float64[Tensor, "m s"], y: Float64[Tensor, "m s"], late: bool) -> None:
-        """Take in samples of every view; late: the time is up, which ends the run if there are `first` samples."""
+    def add(self, x: Float64[Tensor, "m s"], y: Float64[Tensor, "m s"]) -> None:
+        """Take in samples of every view."""
         self.x, self.y = torch.cat([self.x, x.mean(dim=0)]), torch.cat([self.y, y.mean(dim=0)])
         self.differences.append(x - y)
-        self.late = late and self.count >= self.first
-        if self.late:
-            self.open = False
-        elif self.count == self.rule.next:
+        if self.count == self.rule.next:
             self.open = not self.rule.end(self.count, self.estimate().reason == "tolerance")
 
     def estimate(self) -> TraceEstimate:
@@ -225,9 +219,7 @@ class SampledTrace:
         # the fitted coefficient takes one more degree of freedom than the mean
         quantile = t_quantile(self.count - 2, settings.confidence)
         half = quantile * error * (WIDENING if settings.adaptive and self.first < self.most else 1.0)
-        reason: StopReason = "time budget" if self.late else "matvec budget"
-        if settings.reached(value, value - half, value + half):
-            reason = "tolerance"
+        reason: StopReason = "tolerance" if settings.reached(value, value - half, value + half) else "matvec budget"
         return TraceEstimate(
             self.name, self.dim, value, error, value - half, value + half, settings.confidence, self.count, self.count,
             reason, samples, SAMPLED, terms=terms,

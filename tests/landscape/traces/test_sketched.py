@@ -181,27 +181,3 @@ def test_products_that_are_not_finite_are_an_error_that_names_the_block(method):
 
     with pytest.raises(ValueError, match=r"expected finite products H V.*in all"):
         estimate_traces(Broken(INDEFINITE), generator(), TraceSettings.fixed(30, method=method))
-
-
-def test_time_that_is_up_ends_xtrace_after_its_first_look():
-    settings = TraceSettings(rtol=1e-9, max_probes=100, max_seconds=0.0, method="xtrace")
-    estimate = xtrace(DenseOperator(INDEFINITE), generator(), settings, deadline=0.0)
-    assert estimate.reason == "time budget" and estimate.matvecs == 16
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_a_time_budget_holds_for_every_task_of_a_method(method, monkeypatch):
-    """A second each product, by a clock of its own; a batch, the least probes and a look may come beyond."""
-    matrix, seconds = torch.from_numpy(symmetric_matrix(1 / np.arange(1, 401.0) ** 0.5, seed=1)), [0.0]
-
-    class Timed(DenseOperator):
-        def apply(self, V):
-            seconds[0] += V.shape[1]
-            return super().apply(V)
-
-    for module in ("trace", "hutchinson", "sketched"):
-        monkeypatch.setattr(f"landscape.traces.{module}.monotonic", lambda: seconds[0])
-    settings = TraceSettings(rtol=1e-6, max_probes=300, max_seconds=40, method=method)
-    estimate = estimate_traces(Timed(matrix), generator(), settings)["all"]
-    assert estimate.reason == "time budget" and 40 < estimate.matvecs == seconds[0] < 40 + 8 + 2 * settings.batch
-    assert estimate.low < float(matrix.trace()) < estimate.high

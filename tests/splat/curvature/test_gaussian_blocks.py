@@ -242,7 +242,7 @@ def test_intervals_of_fixed_and_adaptive_budgets_cover_as_stated(noise: float) -
             for _ in range(200):
                 block = SampledTrace(name, 0, known[name], pixelwise[name], settings, first, most)
                 while block.open:
-                    block.add(*pool[:, i, [at % pool.shape[2]]][:, None], late=False)
+                    block.add(*pool[:, i, [at % pool.shape[2]]][:, None])
                     at += 1
                 estimate = block.estimate()
                 covered += estimate.low <= truth[name] <= estimate.high
