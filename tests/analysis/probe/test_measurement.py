@@ -82,9 +82,7 @@ def test_the_paper_s_power_iteration_is_read_from_the_density_without_products()
         random_gaussians(15, 1, logit=1.0).to(torch.float64), two_views(), LossSettings(), BACKGROUND.double()
     )
     seen = []
-    settings = replace(
-        ProbeSettings(), slice_points=5, traces=TraceSettings(rtol=0.3), depth=None, density_matvecs=48
-    )
+    settings = replace(ProbeSettings(), slice_points=5, traces=TraceSettings(rtol=0.3), depth=None, density_matvecs=48)
     draw = measurement.spectral_density
 
     def watched(*given, watch, **named):
