@@ -39,10 +39,6 @@ from analysis.records.run_files import (
 from figures.scripts import drawn_by, folder_script
 from figures.style import BLACK, BLUE, GREEN, VERMILION, few_decades, literal, new_figure, round_number, save, style
 
-EXTEND: dict[str, Any] = {
-    "error": "max",
-    "one_view": "neither",
-}  # ends of a scale beyond which something is, if not both
 SAME = 0.02  # greatest difference of curves that look alike, of their axis
 WIDTH, TALLEST = 7.0, 9.0  # inches
 HEAD, LEGEND = 0.35, 0.5  # inches: above a picture, beneath one with a scale
@@ -78,7 +74,7 @@ def show_scaled(axes: Axes, share: UInt8[np.ndarray, "h w"], shade: Shade, title
         ax=axes,
         location="bottom",
         label=literal(label),
-        extend=EXTEND.get(shade.name, "both"),
+        extend=shade.beyond,
         panchor=(0.5, 1.0),
         aspect=30,
         pad=0.03,
@@ -103,7 +99,9 @@ def draw(maps: dict[str, np.ndarray], panel: Panel, record: MapRecord) -> Figure
         _show(second, maps["render"], "Render" if panel.psnr is None else f"Render: {panel.psnr:.1f} dB")
         mean = error.low + (error.high - error.low) * maps["error"].mean() / BYTES
         show_scaled(third, maps["error"], error, f"Error: {mean:.3f} on average", error.unit)
-        show_scaled(fourth, maps[record.field], field, f"Gaussians: {field.words}", field.unit)
+        show_scaled(
+            fourth, maps[record.field], field, f"Gaussians: {field.words}", f"{field.unit}; arrows: values beyond"
+        )
     return figure
 
 
@@ -145,13 +143,13 @@ def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
 
 
 def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
-    """An end of the spectrum: the view with the carriers, and its part at -step, 0 and +step (units of the parameters)."""
+    """An end of the spectrum: the view with the carriers, and its part at -step, 0 and +step."""
     left, top, right, bottom = end.crop
     changes, share = (
         [loss / end.losses[1] - 1 for loss in end.losses],
         percent(sum(each.share for each in end.carriers)),
     )
-    step, (back, _, forth) = quantity(end.step), map(_signed, changes)
+    back, _, forth = map(_signed, changes)
     with style():
         figure, places = _sheet(2, 3, maps["view"].shape[:2], 1)
         axes = dict(zip(("view", "photograph", "zero", "minus", "plus", "difference"), places.flat, strict=True))
@@ -161,8 +159,8 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
         )
         _show(axes["photograph"], maps["photograph"], f"Gaussians with {share} of {end.name}")
         _show(axes["zero"], maps["zero"], f"Render: loss {quantity(end.losses[1])}")
-        _show(axes["minus"], maps["minus"], f"A step of {step} back: loss {back}")
-        _show(axes["plus"], maps["plus"], f"A step of {step} forth: loss {forth}")
+        _show(axes["minus"], maps["minus"], f"A step back: loss {back}")
+        _show(axes["plus"], maps["plus"], f"A step forth: loss {forth}")
         show_scaled(
             axes["difference"], maps["difference"], end.difference, "Render forth minus back", end.difference.unit
         )

@@ -1,9 +1,10 @@
 """Figure: the two cross-sections of a slice, each under what it found, and the plane between them.
 
 Sections: the loss, from true renders; blue dots where the order of the splats or the set of visible ones is not the centre's,
-if it is so at some only; dashed: the quadratic model.  Their titles compare second differences of the loss with the model's,
-and name the steps.  They share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes
-count steps in curvature units: steps within which the curvature alone changes the loss by the amount named.
+if it is so at some only; dashed: the quadratic model.  Their titles say how far renders agree (of a probe's e₁ in the words of
+its report), or compare second differences of the loss with the model's.  They share their vertical axis, so that a steep
+direction looks steep beside a flat one; their upper axes count steps in curvature units: steps within which the curvature
+alone changes the loss by the amount named.
 
 Plane: three contours of the loss and, dashed, of the model at the same levels, those of the colour bar's ticks; grey dots:
 renders; grey: no finite loss; crosses: the checkpoint (upright), and where the plane leads.  Where too few points are renders
@@ -63,10 +64,13 @@ def draw(record: Record) -> Figure:
 
 
 def finding(direction: Direction, change: np.ndarray, model: np.ndarray | None) -> str:
-    """Sentence: how the loss curves from the centre to each step of a section, beside what the curvature says.
+    """Sentence: how far renders agree with the curvature; where a probe does not say it, how the loss curves from the centre to
+    each step of the section, beside what the curvature says.
 
     Of the second differences: a slope cancels in them.
     """
+    if direction.rendered:
+        return f"Along {direction.name} {direction.rendered}"
     along = f"Along {direction.name} the loss"
     centre = direction.centre
     steps = np.arange(1, min(centre, len(change) - 1 - centre) + 1)

@@ -4,7 +4,7 @@ density        where one was recorded, as `figures.density` draws it
 distribution   of the same quadrature, without broadening: the share of directions whose curvature is at most x, and the share
                of sum |lambda| that these have, a line for each start vector; the further apart the two, the less isotropic the
                loss.  A node that is not resolved from 0 is drawn there
-Ritz values    of the search for both ends: value against rank, on a symmetric logarithmic axis (linear in the band about 0).
+eigenvalues    Ritz values of the search for both ends, against their rank, on a symmetric logarithmic axis (linear about 0).
                Bars are residual norms: within each lies a true eigenvalue.  Filled: the residual is under a tenth of the value
 """
 
@@ -85,13 +85,13 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
     axes.set_xlim(0, len(values) + 1)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.set_xlabel("rank")
-    axes.set_ylabel("Ritz value (loss per\nsquared unit of the parameters)")
-    axes.set_title(f"{len(values)} Ritz values, {converged.sum()} converged", loc="left")
+    axes.set_ylabel("curvature (loss per\nsquared unit of the parameters)")
+    axes.set_title(f"{len(values)} eigenvalues met, {converged.sum()} known to {CONVERGED:.0%}", loc="left")
     axes.grid(True)
-    looks = [(f"residual < {CONVERGED:.0%} of the value", "0.3", "0.3"), ("not converged", "0.3", "white")]
+    looks = [(f"known to {CONVERGED:.0%}", "0.3", "0.3"), ("less well", "0.3", "white")]
     looks += [("positive", POSITIVE, POSITIVE), ("negative", NEGATIVE, NEGATIVE)]
     handles = [_handle(label, color=colour, markerfacecolor=face, marker="o") for label, colour, face in looks]
-    handles.insert(2, _handle("± residual", color="0.3", marker="|", markersize=8))
+    handles.insert(2, _handle("a true one lies there", color="0.3", marker="|", markersize=8))
     _legend_below(axes, handles)
 
 

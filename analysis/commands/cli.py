@@ -32,9 +32,15 @@ from analysis.runs.options import CompareOptions, SweepOptions, TrajectoryOption
 from analysis.slice.options import SliceOptions
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError, did_you_mean
+from splat.training.origin.options import require_checkpoint
 
 DEBUG, CHECKPOINT = "--debug", "checkpoint.pt"
 LPIPS = "LPIPS is a score too after: pip install 'splat-landscape[lpips]'"  # the end of train's help
+USUAL = {  # options of other tools' files that every command's help explains
+    "--scene": "FOLDER: the scene on which a file of another tool was trained, or to which ours has moved.",
+    "--views": "N or all: its training views, and",
+    "--trained-by": "graphdeco, gsplat, ...: its tool, where its files do not say them.",
+}
 DRAWN = re.compile(r"\x1b\[[\d;]*m|[\u2500-\u257f]|-{5,}|^[+|]|[+|]$", re.M)  # colours and lines of a box
 SENTENCES = {  # what the parser says in a box, in which words
     r"Error parsing [^:]+: [^']*('.*?').*helptext:\s+([^\n]*\S)": r"expected \2, got \1",
@@ -217,11 +223,13 @@ def _parsed(arguments: Sequence[str]) -> tuple[Command, Any]:
 
 
 def _about(name: str, command: Command) -> str:
-    """What stands above the options in a command's help; those of other tools' files are in the help of convert alone."""
+    """What stands above the options in a command's help; of those on other tools' files it has USUAL, and convert's has all."""
     lines = [str(inspect.getdoc(command.options)), f"Example: landscape {name} {command.example}".rstrip()]
     if name != "convert" and (foreign := command.options.__dataclass_fields__.get("foreign")):
-        names = ", ".join(f"--{each.name.replace('_', '-')}" for each in fields(foreign.default_factory))
-        lines.insert(1, f"Also, as landscape convert --help explains: {names}")
+        names = [f"--{each.name.replace('_', '-')}" for each in fields(foreign.default_factory)]
+        usual = " ".join(f"{each} {words}" for each, words in USUAL.items())
+        rest = ", ".join(each for each in names if each not in USUAL)
+        lines.insert(1, f"{usual} As landscape convert --help explains: {rest}.")
     return "\n\n".join(lines)
 
 
@@ -244,6 +252,7 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     from analysis.records.provenance import require_seed  # not for --help
 
     require_seed(getattr(options, "seed", 0))
+    _require_there(options)
     _require_compiler()
     name, function = command.runs.split(":")
     with ExitStack() as around:
@@ -261,6 +270,18 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
         if command.recorded:
             around.enter_context(interruption())
         return getattr(module, function)(*given)
+
+
+def _require_there(options: Any) -> None:
+    """FileNotFoundError where a scene or a checkpoint is not: at once, as libraries take seconds to load."""
+    from splat.model.untrusted import require_scene  # not for --help
+
+    for folder in (getattr(options, "scene", None), getattr(getattr(options, "foreign", None), "scene", None)):
+        if isinstance(folder, Path):
+            require_scene(folder)
+    for name in ("checkpoint", "source"):
+        if isinstance(path := getattr(options, name, None), Path) and ":" not in path.name:  # FILE.py:FACTORY
+            require_checkpoint(path)
 
 
 def _require_compiler() -> None:

@@ -3,14 +3,11 @@
 mass       of Gaussian i in a unit vector v: the sum of v^2 over its parameters
 carriers   the Gaussians with a share of LEAST of the mass or more, MOST at most; the heaviest in any case
 view       the one in which the first carrier has most weight: the sum of alpha T over the pixels (`Sight.weight`, px)
-steps      sqrt(2 RISE L / |lambda|), at which curvature alone changes the loss L by RISE L, halved again and again
-factor     of a step s: the mean change of the rendered loss at +s and -s, over lambda s^2 / 2; the slope cancels, and the
-           factor is 1 where the second-order model holds
 kinks      sum_p w j^2 [|r| < NEAR] / NEAR over the numbers p of the images (w: weight in the loss, r: residual, j: its change
            along v): the mean of w (|r + s j| + |r - s j| - 2 |r|) / s^2 where residuals are spread evenly near 0.  A curvature
            that L1 has in every direction, never below 0, and that the Hessian, at signs held still, leaves out
-renders    of the part of the view around the carriers, all Gaussians moved by -step, 0 and +step along v; the step is the
-           longest whose factor is within AGREES of 1, else the longest whose factor is above 0, else the longest of all
+renders    of the part of the view around the carriers, all Gaussians moved by -step, 0 and +step along v; of the steps that the
+           probe rendered (`Renders`) the longest whose ratio is within AGREES of 1, else with one above 0, else of all
 
 Why renders can refute a small negative end.  On fern (2,000 steps) lambda_min is -0.074, but second differences of rendered
 losses over 1/4 to 4 steps of the optimiser are +0.20 to +0.22.  Kinks of L1 make 0.11 to 0.17 of the gap (0.15 by the formula),
@@ -20,7 +17,6 @@ steps) 48 becomes 61 over the optimiser's step, where kinks make 13 by the formu
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,12 +25,10 @@ from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
 from analysis.measures.localization import mass_shares, masses, participation
-from analysis.records.quantities import AGREES, Shade, percent, quantity, ratio, rough
+from analysis.records.findings import attribute_name, optimiser_steps, what_renders_say
+from analysis.records.quantities import AGREES, Shade, percent, ratio, rough
 from analysis.records.run_files import Carrier, Steepest
-from analysis.records.schema import Carries
-from landscape import curvature_reach
-from landscape.slices.finite_probe import WITHIN
-from splat.backend.cpu.threads import single_threaded, thread_count
+from analysis.records.schema import Carries, Renders
 from splat.curvature.fields import Values
 from splat.curvature.objective import SceneObjective
 from splat.projection.formulas import lens_of
@@ -48,12 +42,9 @@ from splat.scenes.write import bytes_of
 
 NEAR = 0.01  # |residual|, of a range of 1, below which residuals are taken to be spread evenly
 LEAST, MOST = 0.05, 5  # smallest share of the mass of a carrier; most carriers
-RISE = 0.01  # relative change of the loss at the longest step, by the curvature
-STEPS = 7  # each half of the one before; the shortest: 2e-6 of the loss, above round-off
 SIGMAS = 2.0  # standard deviations at which an outline is drawn
 TINY = torch.finfo(torch.float32).tiny
 ROOM, SMALLEST = 1.3, 8  # size of a crop: times the outlines; at least 1 / SMALLEST of its view
-VERBS = {"means": "moves", "log_scales": "stretches", "quats": "turns", "opacity_logits": "fades", "sh": "recolours"}
 PLACES = (
     ("in the upper left", "at the top", "in the upper right"),
     ("at the left", "in the middle", "at the right"),
@@ -64,12 +55,13 @@ Pictures = dict[str, UInt8[np.ndarray, "..."]]
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """An end of the spectrum: unit eigenvector and eigenvalue.  title: e.g. "the steepest direction"."""
+    """An end of the spectrum: unit eigenvector, eigenvalue, renders along it.  title: e.g. "the steepest direction"."""
 
     name: str
     title: str
     vector: Float[Tensor, " p"]
     curvature: float
+    renders: Renders
 
 
 def steepest(
@@ -87,22 +79,17 @@ def steepest(
     view = objective.views[_view_with_most(sights, chosen[0])]
     carriers = [_carrier(objective, view, end.vector, values, mass, i) for i in chosen]
     crop = crop_around([each.outline for each in carriers], view.camera.width, view.camera.height)
-    loss = objective.loss(objective.active.flat)
-    steps = [curvature_reach(end.curvature, RISE * loss) / 2**k for k in range(STEPS)]
-    pairs = _losses_at(objective, end.vector, steps)
-    factors = [
-        (back + forth - 2 * loss) / (end.curvature * step**2) for step, (back, forth) in zip(steps, pairs, strict=True)
-    ]
-    best = shown_step(factors)
+    step = shown_step(end.renders)
     places = {
-        name: objective.active.flat + sign * steps[best] * end.vector
+        name: objective.active.flat + sign * step * end.vector
         for name, sign in (("minus", -1), ("zero", 0), ("plus", 1))
     }
+    back, here, forth = map(objective.loss, places.values())
     pictures, difference = _pictures(objective, view, places, crop)
     found = Steepest(
         name=end.name, curvature=end.curvature, participation=spread, carriers=carriers, view=view.name,
-        crop=crop, step=steps[best], losses=(pairs[best][0], loss, pairs[best][1]), difference=difference, file=file,
-        steps=steps, factors=factors, rendered=rendered_sentence(end, loss, steps, factors),
+        crop=crop, step=step, length=optimiser_steps(end.renders, step), losses=(back, here, forth), difference=difference,
+        file=file, rendered=rendered_sentence(end, (back, here, forth), step),
         sentence=sentence(end, carriers, spread, view, len(objective.views)),
     )  # fmt: skip
     return found, pictures
@@ -168,60 +155,33 @@ def _view_with_most(sights: Sequence[Sight], gaussian: int) -> int:
     return int(torch.stack([each.weight[gaussian] for each in sights]).argmax())
 
 
-def _losses_at(
-    objective: SceneObjective, vector: Float[Tensor, " p"], steps: Sequence[float]
-) -> list[tuple[float, float]]:
-    """The loss at -step and at +step for every step, computed in parallel."""
+def shown_step(renders: Renders) -> float:
+    """The longest step whose ratio is within AGREES of 1, else the longest with one above 0, else the longest.
 
-    @single_threaded()
-    def loss(step: float) -> float:
-        return objective.loss(objective.active.flat + step * vector)
-
-    with ThreadPoolExecutor(thread_count()) as pool:
-        found = list(pool.map(loss, [sign * step for step in steps for sign in (-1, 1)]))
-    return list(zip(found[::2], found[1::2], strict=True))
-
-
-def shown_step(factors: Sequence[float]) -> int:
-    """Index of the longest step whose factor is within AGREES of 1, else of the longest with one above 0, else of the longest.
-
-    factors: of the steps, the longest first.
-
-    >>> shown_step([0.5, 1.1, 0.9]), shown_step([-0.2, 0.5]), shown_step([-0.2, -1.0])
-    (1, 1, 0)
+    >>> shown_step(Renders(confirmed=None, steps=[1.0, 2.0, 4.0], ratios=[0.9, 1.1, 0.5], errors=[0.0] * 3))
+    2.0
     """
-    agree = [k for k, factor in enumerate(factors) if abs(factor - 1) <= AGREES]
-    return next(iter(agree + [k for k, factor in enumerate(factors) if factor > 0]), 0)
+    known = [(step, ratio) for step, ratio in zip(renders.steps, renders.ratios, strict=True) if ratio is not None]
+    tests = (lambda ratio: abs(ratio - 1) <= AGREES, lambda ratio: ratio > 0)
+    chosen = [step for fits in tests for step, ratio in reversed(known) if fits(ratio)]
+    return next(iter(chosen), renders.steps[-1])
 
 
-def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Sequence[float]) -> str:
-    """Sentence that compares renders with the curvature, at the step shown and over all steps, the longest first."""
-    best = shown_step(factors)
-    step, factor = steps[best], factors[best]
-    alone = 50 * end.curvature * step**2 / loss  # curvature step^2 / 2, in percent of the loss
-    extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])} units of the parameters"
-    ways = ("lower", "raise") if end.curvature < 0 else ("raise", "lower")
-    if not factor > 0:
-        kind = "negative curvature" if end.curvature < 0 else "curvature"
-        return (
-            f"The {kind} along {end.name} is not confirmed by renders: {extent} {ways[1]} the loss, back and forth together, "
-            f"where by the curvature they would {ways[0]} it."
-        )
-    moved = f"{quantity(step)} units of the parameters along {end.name}"
-    text = f"A step of {moved} {ways[0]}s the loss by {rough(abs(factor * alone))}%"
-    text += f", the mean of back and forth (by its curvature alone: {rough(abs(alone))}%)"
-    if abs(factor - 1) > AGREES:
-        text += f", {quantity(factor)} times as much as the curvature has it"
-    if max(abs(each - 1) for each in factors) <= AGREES:
-        return f"{text}."
-    low, high = quantity(min(factors)), quantity(max(factors))
-    beyond = sum(not 1 / WITHIN <= factor <= WITHIN for factor in factors)
-    verdict = (
-        f"outside of 1/{WITHIN:g} to {WITHIN:g} at {beyond} of {len(factors)}, where they refute it"
-        if beyond
-        else f"all within 1/{WITHIN:g} to {WITHIN:g}"
+def rendered_sentence(end: End, losses: tuple[float, float, float], step: float) -> str:
+    """Sentence on renders along an end of the spectrum: what the step shown does, and how far they agree with the curvature.
+
+    losses: at -step, 0 and +step.
+    """
+    back, loss, forth = losses
+    found, alone = 50 * (back + forth - 2 * loss) / loss, 50 * end.curvature * step**2 / loss  # percent
+    said = what_renders_say(end.curvature, end.renders)
+    if not found * alone > 0:
+        return f"The {'negative ' * (end.curvature < 0)}curvature along {end.name} is {said}."
+    way = "raises" if alone > 0 else "lowers"
+    return (
+        f"A step of {optimiser_steps(end.renders, step)} along {end.name} {way} the loss by {rough(abs(found))}%, the mean of "
+        f"back and forth (by its curvature alone: {rough(abs(alone))}%); {said}."
     )
-    return f"{text}; over {extent} by {low} to {high} times what the curvature has, {verdict}."
 
 
 def _carrier(
@@ -306,7 +266,7 @@ def _pictures(
 
 
 def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, count: int) -> str:
-    """Sentence on the first carrier: its share of the vector, shape and place.  The verb names its attribute of most mass.
+    """Sentence on the first carrier: its share of the vector, attribute of most mass, shape and place.
 
     spread: participation of the vector; count: number of views.
     """
@@ -319,8 +279,8 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
         seen += f", with {first.one_view:.0%} of its weight in one"
     alone = "" if first.share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
     return (
-        f"{percent(first.share)} of {end.name}, {end.title}, lies on Gaussian {first.gaussian:,}, which it {VERBS[name]}: "
-        f"{shape(first, view)}, seen by {seen}{alone}."
+        f"{percent(first.share)} of {end.name}, {end.title}, lies on Gaussian {first.gaussian:,}, most of it in "
+        f"{attribute_name(name)}: {shape(first, view)}, seen by {seen}{alone}."
     )
 
 

@@ -35,7 +35,6 @@ from analysis.records.page.report import write_report
 from analysis.records.page.summary import guess, remarks, steps_made, summary
 from analysis.records.provenance import provenance_of, require_seed
 from analysis.records.records import ProbeRecord, record_folder, require_replaceable
-from analysis.records.run_files import CHECKPOINT
 from analysis.records.tables import family_table
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
@@ -127,9 +126,7 @@ def _run(
     if writes:
         shutil.rmtree(unfinished, ignore_errors=True)
         conclude(data, out, guessed)
-        of = options.checkpoint.parent if options.checkpoint.name == CHECKPOINT else options.checkpoint
-        more = ", with the options on its tool and scene" if options.foreign.scene else ""
-        say(f"next: open the report in a browser; landscape map {shlex.quote(str(of))}{more}")
+        say(f"next: open the report in a browser; {origin.other_command('map')}")
     failed = any(check.passed is False for check in data.checks.values())
     return CHECK_FAILED if options.strict and failed else 0
 

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Literal, TypeGuard
 
 from msgspec import UNSET
@@ -123,6 +124,34 @@ def largest_steps(data: ProbeRecord) -> tuple[str, str, float] | None:
     return first, second, (least + most) / sum(other)
 
 
+def optimiser_steps(renders: schema.Renders, *steps: float) -> str:
+    """Lengths along an eigenvector in words: as multiples of the optimiser's step, which are powers of 2, where it is known.
+
+    >>> found = schema.Renders(confirmed=None, optimiser_step=0.008, steps=[0.008], ratios=[1.0], errors=[0.0])
+    >>> optimiser_steps(found, 0.002, 0.032)
+    "1/4 to 4 × the optimiser's step"
+    """
+    step = renders.optimiser_step
+    known = [str(Fraction(each / step).limit_denominator(1000)) if step else rough(each) for each in steps]
+    unit = "× the optimiser's step" if step else "units of the parameters"
+    return f"{' to '.join(known)} {unit}"
+
+
+def what_renders_say(value: float, renders: schema.Renders) -> str:
+    """Over which steps renders agree with an eigenvalue, or why they do not: in these words wherever it is told."""
+    if renders.confirmed:
+        steps = optimiser_steps(renders, renders.low or 0.0, renders.high or 0.0)
+        return f"renders agree within a factor of 2 at {steps}"
+    if renders.confirmed is None:
+        return "not resolved: round-off hides it in renders"
+    why = ""
+    if renders.kinks > abs(value):
+        why = f", as kinks of L1, which the eigenvalue leaves out, curve by {rough(renders.kinks)}"
+    elif (ratio := renders.at_step) is not None:
+        why = f", by which it is {rough(ratio * value)} over the optimiser's step"
+    return f"not confirmed by renders{why}" + (": no saddle is claimed" if value < 0 else "")
+
+
 def _of_ends(data: ProbeRecord) -> list[Line]:
     ends = data.eigenvalues
     numbers = [number for end in (ends.max, ends.min) for number in (end.value, end.residual) if _is_finite(number)]
@@ -167,7 +196,7 @@ def is_loose(index: schema.Index) -> bool:
 def remedy(data: ProbeRecord, name: str) -> str:
     """The command that resolves an index, as far as any does."""
     made, ends = data.provenance, data.eigenvalues
-    command = made.command or f"landscape probe {made.checkpoint or 'CHECKPOINT'}"
+    command = made.command or made.other_command("probe")
     reasons = {end.reason for end in (ends.max, ends.min)}
     if "matvec budget" in reasons:
         spent = ends.min.matvecs or 1
@@ -233,7 +262,7 @@ def unresolved(plane: schema.Slice, made: Provenance) -> str:
     """Why a plane is not drawn, and the command that resolves it."""
     return (
         f"Between its two sections the plane is not known{_to_tolerance(plane)} from {plane.evaluated_points:,} of "
-        f"{plane.points:,} renders, and no surface is drawn; landscape slice {made.checkpoint} renders more."
+        f"{plane.points:,} renders, and no surface is drawn; {made.other_command('slice')} renders more."
     )
 
 

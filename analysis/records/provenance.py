@@ -6,6 +6,7 @@ import platform
 import shlex
 import subprocess
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +17,7 @@ from msgspec import UNSET, Meta, Struct, convert
 from analysis.records.schema import Maybe, NonNegative, Number
 from landscape.errors import InputError
 from splat.training.origin.fingerprint import Fingerprint
+from splat.training.origin.options import Foreign
 
 if TYPE_CHECKING:
     from splat.training.origin.subject import Subject
@@ -96,6 +98,22 @@ class Provenance(Struct, kw_only=True):
     threads: Maybe[int] = UNSET
     command: Maybe[str] = UNSET
     fingerprint: Maybe[Fingerprint] = UNSET
+
+    def other_command(self, name: str) -> str:
+        """Another command on the same checkpoint, whole: with what was typed of another tool's file and its scene.
+
+        >>> made = provenance(0, checkpoint="a.ply", command="landscape probe --guess-views a.ply --seed 1 --scene 'my fern'")
+        >>> made.other_command("map")
+        "landscape map a.ply --guess-views --scene 'my fern'"
+        """
+        takes = {f"--{each.name.replace('_', '-')}": not isinstance(each.default, bool) for each in fields(Foreign)}
+        typed, kept = iter(shlex.split(self.command or "")), list[str]()
+        for word in typed:
+            option, given, _ = word.replace("_", "-").partition("=")
+            if option in takes:
+                kept += [word, next(typed, "")] if takes[option] and not given else [word]
+        at = (self.checkpoint or "CHECKPOINT").removesuffix("/checkpoint.pt")
+        return shlex.join(["landscape", name, at, *kept])
 
 
 def require_seed(seed: int) -> None:

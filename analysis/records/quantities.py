@@ -8,7 +8,7 @@ spaces within a number are HARD, so that it is not broken over lines.
 import math
 from collections.abc import Callable, Iterable
 from decimal import Decimal
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -21,6 +21,11 @@ PLUS_MINUS, TIMES = f"{HARD}±{HARD}", f"{HARD}×{HARD}"
 DIGITS = 3  # significant
 AGREES = 0.2  # largest |ratio - 1| of two numbers that are said to agree
 BYTES, NOTHING = 254, 255  # of a scale in bytes: its upper end, and the code of no value
+BEYOND = {
+    "error": "max",
+    "one_view": "neither",
+    "difference": "neither",
+}  # ends of a scale with values beyond, if not both
 GREY = 128  # the colour of no value, in bytes
 SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS (VGG)", "avge": "AVGE"}  # of metrics.json
 PLACES = {"psnr": 2, "ssim": 4, "lpips": 4, "avge": 4}
@@ -79,13 +84,13 @@ def extent(values: Iterable[float], words: Callable[[float], str] = rough) -> st
 
 
 def solved(value: float | None, residual: float | None) -> str:
-    """`measured` of an eigenvalue, whose error is the solver's residual: the digits that tables have.
+    """`measured` of an eigenvalue, whose error, the residual, is named as numerical: other trainings differ by more.
 
     >>> [text.replace(HARD, " ") for text in (solved(27.438, 1e-5), solved(-0.17, 0.02), solved(1.0, None))]
-    ['27.4', '−0.170 ± 0.020 (solver)', '1.00 ± ? (solver)']
+    ['27.4', '−0.170 ± 0.020 (numerical)', '1.00 ± ? (numerical)']
     """
     text = measured(value, residual)
-    return f"{text} (solver)" if PLUS_MINUS in text else text
+    return f"{text} (numerical)" if PLUS_MINUS in text else text
 
 
 def measured(value: float | None, error: float | None) -> str:
@@ -265,6 +270,11 @@ class Shade(Struct, frozen=True, kw_only=True):
         return self.name == "order_gap"
 
     @property
+    def beyond(self) -> Any:
+        """Ends of the scale beyond which values lie: they have its colour."""
+        return BEYOND.get(self.name, "both")
+
+    @property
     def palette(self) -> UInt8[np.ndarray, "256 3"]:
         """The colours of `bytes`; grey of no value."""
         from matplotlib import colormaps  # slow to import, and most readers of a record need no colours
@@ -275,11 +285,13 @@ class Shade(Struct, frozen=True, kw_only=True):
 
     @property
     def legend(self) -> str:
-        """The colours and the values at both ends, in HTML."""
+        """The colours and the values at both ends, ≤ and ≥ where others lie beyond, in HTML."""
         stops = ", ".join(
             "rgb({}, {}, {})".format(*colour) for colour in self.palette[np.linspace(0, BYTES, 9, dtype=int)]
         )
-        ends, way = [rough(self.value(t)) for t in (self.low, self.high)], "right"
+        signs = {"both": "≤≥", "max": " ≥"}.get(self.beyond, "  ")
+        ends = [f"{sign} {rough(self.value(t))}".strip() for sign, t in zip(signs, (self.low, self.high), strict=True)]
+        way = "right"
         if self.falls:
             ends, way = ends[::-1], "left"
         middle = "<span class=scale>logarithmic</span>" if self.scale == "log" else ""

@@ -136,10 +136,9 @@ class Steepest(Struct, kw_only=True):
     """An eigenvector of one end of the spectrum, shown where it acts.
 
     curvature: its eigenvalue.  participation: over how many Gaussians it is spread.  view: in which the first of the carriers
-    weighs most; crop: left, top, right, bottom of the part that is shown, px.  step: along the unit vector; losses: at -step,
-    0, +step.  steps, factors: of other lengths, the longest first, the mean change of the loss by both, rendered, over that by
-    the curvature.  rendered: these in words.  difference: scale of render(+step) - render(-step).  file: of
-    the pictures, NAME.npz.
+    weighs most; crop: left, top, right, bottom of the part that is shown, px.  step: along the unit vector; length: this in
+    words; losses: at -step, 0, +step.  rendered: how far renders agree, in words.  difference: scale of render(+step) -
+    render(-step).  file: of the pictures, NAME.npz.
     """
 
     name: str
@@ -150,8 +149,7 @@ class Steepest(Struct, kw_only=True):
     crop: tuple[Count, Count, Count, Count]
     step: NonNegative
     losses: tuple[float, float, float]
-    steps: list[float] = []
-    factors: list[float] = []
+    length: str = ""
     difference: Shade
     file: FileName
     sentence: str

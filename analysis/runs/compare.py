@@ -209,7 +209,7 @@ def _once(lines: Sequence[tuple[Run, str]]) -> list[str]:
 
 
 def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], found: Sequence[str], out: Path) -> None:
-    """Table, pictures, page; and what it says, the table and the cautions once more for the terminal.
+    """Table, pictures, page; and what it says, the cautions and the table once more for the terminal.
 
     found: the cautions so far.
     """
@@ -233,9 +233,9 @@ def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], fo
     notes += draw("compare", out)
     write_atomically(out / PAGE, render_page(runs, groups, shown, says, notes, out).encode(errors="backslashreplace"))
     say(*says, console=console)
+    say(*notes, style="yellow", console=console)
     console.print(compare_table(shown, headings(groups)))
     say(*[SPREAD] * (len(groups) < len(runs)), console=console)
-    say(*notes, style="yellow", console=console)
     say(f"open {out / PAGE}; numbers: {out / TABLE}", console=console)
 
 

@@ -288,6 +288,15 @@ def require_name(name: str) -> str:
     return name
 
 
+def require_scene(folder: Path) -> None:
+    """FileNotFoundError where there is no folder of a scene."""
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"expected a scene folder, {folder} {'is not a folder' if folder.exists() else 'does not exist'}; "
+            "name the one that holds the cameras; landscape sfm makes it of photographs"
+        )
+
+
 def require_content(path: Path) -> None:
     """InputError where a file is the pointer that git lfs left in its place; nothing where there is no file."""
     if path.is_file():

@@ -25,6 +25,7 @@ from landscape.errors import InputError
 from landscape.results import ShortRepr
 from splat.backend.memory import free_memory
 from splat.model.camera import Camera
+from splat.model.untrusted import require_scene
 from splat.scenes.formats.colmap import MODEL_FOLDERS, find_model, part_of_model, read_colmap
 from splat.scenes.formats.dtu import is_dtu, mask_folder, read_dtu
 from splat.scenes.formats.llff import POSES, read_llff
@@ -135,11 +136,7 @@ def load_scene(
     torch.Size([3, 12, 16])
     """
     root = Path(path)
-    if not root.is_dir():
-        raise FileNotFoundError(
-            f"expected a scene folder, {root} {'is not a folder' if root.exists() else 'does not exist'}; "
-            "name the one that holds the cameras; landscape sfm makes it of photographs"
-        )
+    require_scene(root)
     if not 1 <= downscale < float("inf"):
         raise InputError(f"expected downscale of at least 1, got {downscale}")
     found = _read(root, images, points)

@@ -7,7 +7,6 @@ which torch omits.  The same training gives the same bytes.
 
 import io
 import sys
-import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from math import inf
@@ -17,9 +16,9 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from landscape.errors import InputError, did_you_mean, lacks_memory
+from landscape.errors import InputError, lacks_memory
 from splat.model.files.read import is_foreign
-from splat.model.files.tensor_files import loaded
+from splat.model.files.tensor_files import is_archive, loaded
 from splat.model.gaussians import Gaussians
 from splat.model.typed import MOST, Count, leaves, typed
 from splat.model.untrusted import require_content, write_atomically
@@ -27,14 +26,12 @@ from splat.training.adam import Adam
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
 from splat.training.origin.foreign import foreign_training
-from splat.training.origin.options import OF_ALL, Foreign
+from splat.training.origin.options import FILE, KIND, OF_ALL, Foreign, require_checkpoint
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.origin.subject import Checkpoint, Subject
 from splat.training.state import Method, TrainConfig, Training
 
-FILE = "checkpoint.pt"  # of a run
 FORMAT, VERSION = "splat-landscape checkpoint", 3
-KIND = "expected a checkpoint written by landscape train"
 REMEDY = "take another copy of the file, or train anew"
 
 
@@ -180,8 +177,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file; name ...
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{KIND} at {path}, found {_instead(path)}")
+    require_checkpoint(path)
     require_content(path)
     with path.open("rb") as file:  # one file throughout: a training may replace it meanwhile
         content = _read(file, path)
@@ -191,28 +187,13 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         raise InputError(f"{KIND}, got {path}: {error}; {REMEDY}") from error
 
 
-def _instead(path: Path) -> str:
-    """Description of the thing at path that is no checkpoint, and which path to name instead."""
-    if not path.exists():
-        near = path.parent if path.name == FILE else path
-        beside = [each.name for each in near.parent.iterdir()] if near.parent.is_dir() else []
-        return f"no such file{did_you_mean(near.name, beside) or '; name a run, or a file of Gaussians'}"
-    if (inside := path / FILE).is_file():
-        return f"a folder; name the {inside} in it"
-    if runs := sorted(path.glob("*/checkpoint.pt")):
-        return f"a folder of runs; name one of them, such as {runs[0].parent}"
-    if (path.parent / FILE).is_file():
-        return f"a folder within the run {path.parent}; name that"
-    return "a folder without one; name the run that landscape train wrote, its --out"
-
-
 def _read(file: BinaryIO, path: Path) -> Any:
     """The content that torch saved, after a test of its checksums."""
     try:
         return loaded(file)
     except InputError as error:
         runs = [folder for folder in path.absolute().parents[:2] if (folder / FILE).is_file()]
-        if runs and path.name != FILE and not zipfile.is_zipfile(path):
+        if runs and path.name != FILE and not is_archive(file):
             raise InputError(f"{KIND}, got {path}, another file of the run {runs[0]}; name that run") from error
         ply = " (of other tools' files, probe, slice and convert read those)" if path.suffix.lower() == ".ply" else ""
         raise InputError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {error}; {REMEDY}") from error

@@ -171,7 +171,7 @@ def test_ritz_values_and_ends_are_headed_by_what_is_converged_and_confirmed(tmp_
     first, top, bottom = axes[-1].get_title(loc="left").split("\n")
     found = arrays["spectrum"]
     converged = (found["residuals"] < spectrum.CONVERGED * abs(found["ritz_values"])).sum()
-    assert first == f"60 Ritz values, {converged} converged" and 0 < converged < 60
+    assert first == f"60 eigenvalues met, {converged} known to 10%" and 0 < converged < 60
     assert top.startswith("λ max: ") and bottom.startswith("λ min, not confirmed: ")
     assert any(text.get_text().startswith("λ min, not confirmed = ") for text in axes[0].texts)
 
@@ -311,6 +311,14 @@ def test_a_section_is_headed_by_how_far_its_curvature_holds(tmp_path, ratio, sai
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     titles = [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes]
     assert f"Along {data['slice']['directions'][0]['name']} the loss {said}" in titles
+    reach = float(arrays["slice"]["x"].max())
+    of = {"steps": [reach / 4], "ratios": [1.2], "errors": [0.1], "low": reach / 16, "high": reach, "confirmed": True}
+    data["eigenvalues"]["max"]["renders"] = of | {"optimiser_step": reach / 4}
+    figure = slice2d.draw(written(tmp_path / "rendered", data, arrays))
+    title = next(axes.get_title(loc="left") for axes in figure.axes if "Along e₁" in axes.get_title(loc="left"))
+    told = "renders agree within a factor of 2 at 1/4 to 4 × the optimiser's step (drawn: to 4.0 ×)"
+    assert title.replace("\n", " ") == f"Along e₁ {told}"
+    require_layout(figure)
 
 
 def test_a_plane_of_too_few_renders_is_drawn_as_its_sections_with_the_command_that_resolves_it(tmp_path):

@@ -166,7 +166,9 @@ def _write(folder: Path, data: MapRecord) -> None:
 def _conclude(data: MapRecord, first: Mapping[str, Any], kind: Field, out: Path) -> None:
     say(f"{data.seen:,} of {data.gaussians:,} Gaussians are in sight", *data.sentences)
     if not data.steepest:
-        say("for the Gaussians that carry the steepest directions: landscape probe, then map again")
+        say(
+            f"for Gaussians that carry the steepest directions: {data.provenance.other_command('probe')}, then map again"
+        )
     most = f"most of it at Gaussian {int(first['gaussian']):,}"
     say(f"of each Gaussian by itself, {kind.words}: {most}, {in_words(kind, float(first[data.field]))}")
     say(*data.notes, style="yellow")

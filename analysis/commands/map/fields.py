@@ -72,9 +72,9 @@ def measured_fields(
             "e_min": ("smallest", about.min, "the flattest direction"),
         }
         for name, (group, end, title) in known.items():
-            if group in vectors and vectors[group].shape[1] and end.value:
+            if group in vectors and vectors[group].shape[1] and end.value and end.renders:
                 title = "the most negative direction" if end.value < 0 else title
-                ends[name] = End(ENDS[name], title, torch.from_numpy(vectors[group][:, 0]), end.value)
+                ends[name] = End(ENDS[name], title, torch.from_numpy(vectors[group][:, 0]), end.value, end.renders)
                 values[name] = masses(ends[name].vector, objective.active)
                 kinds[name] = Field(f"share of {ENDS[name]}", "", "log")
     return Fields(values, kinds, ends, sights)

@@ -46,7 +46,8 @@ PICTURES = {
 }
 COMPARED = (  # of the traces, where the record has these steps
     "By how much of itself the loss changes in a random step as long as the optimiser's first, which compares; beside the "
-    "names their traces, each in its own unit."
+    "names their traces, each in its own unit. Rendered steps change it by more than curvature says: over a whole step L1's "
+    "kinks curve too, splats change their order, and the Hessian sees neither."
 )
 PIXEL = "1 px along the ray: a way as long as the one that moves a splat by a pixel where it is across the ray."
 GLOSSARY = {  # of the words that a page uses
@@ -62,7 +63,10 @@ GLOSSARY = {  # of the words that a page uses
     "dim": "number of directions of a block; of colours, of those that some view sees",
     "rank": "number of directions of the parameters that are not exactly flat",
     "kinks": "points at which L1's slope jumps: the curvature that they make over finite steps is not in the Hessian",
-    "optimiser's step": "as long as the first that Adam takes, of random signs: the learning rate in every parameter",
+    "optimiser's step": "as long as the first that Adam takes, of random signs: the learning rate in every parameter; along a "
+    "direction, the root mean square of its part there",
+    "numerical": "behind ±: how well an eigenvalue was found; a true one lies within. Other trainings differ by more",
+    "noise floor": "the search ended where rounding in products of the Hessian allows no smaller error",
     "participation ratio": "(sum of |curvature|)² over the sum of its squares: over how many directions curvature is spread",
     "quadrature width": "of the sum of |curvature|: the mean distance of its two bounds, over the start vectors",
     "start vector": "random vector from which the density is made; each gives an estimate of its own",
@@ -280,7 +284,9 @@ def carriers_in_words(end: Steepest) -> str:
     first = end.carriers[0]
     turn = 2 * math.degrees(math.atan(end.step * math.sqrt(first.attributes.get("quats", 0.0))))
     turned = f" The step turns Gaussian {first.gaussian:,} by {quantity(turn)}°." if turn > 0 else ""
-    return f"{place}: its carriers, outlined at two standard deviations, and renders a step back and forth. {carriers}.{turned}"
+    length = f" ({end.length})" if end.length else ""
+    pictures = f"its carriers, outlined at two standard deviations, and renders a step back and forth{length}"
+    return f"{place}: {pictures}. {carriers}.{turned}"
 
 
 def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:

@@ -11,13 +11,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from analysis.records.findings import Line, changes_by_steps, findings, is_loose, largest_steps
-from analysis.records.quantities import UNDETERMINED, apart, percent, quantity, rough, solved
+from analysis.records.findings import Line, changes_by_steps, findings, is_loose, largest_steps, what_renders_say
+from analysis.records.quantities import UNDETERMINED, apart, extent, percent, quantity, rough, solved
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import Eigenvalue
 
 SHORT = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "colour"}
-MOVED = {"means": "moved", "log_scales": "stretched", "quats": "turned", "opacity_logits": "faded", "sh": "recoloured"}
 CARRIED = 0.5  # least share of an eigenvector that one Gaussian has where it is said to carry it
 ONE = "one training"
 
@@ -103,7 +102,7 @@ def _end(end: Eigenvalue) -> str:
         kinks = f"; kinks of L1 add about {rough(renders.kinks)} at short steps" if renders.kinks else ""
         notes.insert(0, f"{over} over the optimiser's step in renders{kinks}")
     text = f"{solved(value, end.residual)}{apart(end.views_error)} ({'; '.join(notes)})"
-    return f"{text}{_carrier(end)}; {_rendered(end)}"
+    return f"{text}{_carrier(end)}; {what_renders_say(value, renders) if renders else 'not rendered'}"
 
 
 def _carrier(end: Eigenvalue) -> str:
@@ -114,30 +113,14 @@ def _carrier(end: Eigenvalue) -> str:
     random = f"(of a random direction {percent(carrier.random_share)})"
     if carrier.share < CARRIED:
         return f": over several Gaussians, at most {percent(carrier.share)} on one {random}"
-    shape = f"{carrier.shape}, " if carrier.shape else ""
-    text = f": {percent(carrier.share)} on Gaussian {carrier.gaussian:,} {random}, {shape}{MOVED[carrier.attribute]}"
+    most = ", ".join(filter(None, (f"most of it in {SHORT[carrier.attribute]}", carrier.shape)))
+    text = f": {percent(carrier.share)} on Gaussian {carrier.gaussian:,} {random}, {most}"
     if carrier.wide:
         place, value, _ = carrier.wide
         return f"{text}; number {place} from this end ({quantity(value)}) is the first eigenvector on more than ten Gaussians"
     if carrier.found < 2:
         return text
     return f"{text}; each of the first {carrier.found} eigenvectors from this end lies on at most ten Gaussians"
-
-
-def _rendered(end: Eigenvalue) -> str:
-    renders = end.renders
-    if not renders:
-        return "not rendered"
-    if renders.confirmed:
-        return f"renders agree within a factor of 2 at steps of {rough(renders.low)} to {rough(renders.high)}"
-    if renders.confirmed is None:
-        return "not resolved: round-off hides it in renders"
-    value, why = end.value or 0.0, ""
-    if renders.kinks > abs(value):
-        why = f", as kinks of L1, which the eigenvalue leaves out, curve by {rough(renders.kinks)}"
-    elif (ratio := renders.at_step) is not None:
-        why = f", by which it is {rough(ratio * value)} over the optimiser's step"
-    return f"not confirmed by renders{why}" + (": no saddle is claimed" if value < 0 else "")
 
 
 def _step(data: ProbeRecord) -> str:
@@ -161,8 +144,8 @@ def _spread(data: ProbeRecord) -> str:
         low, high = map(rough, (known.half.low, known.half.high))
         among = f"at most {high}" if (known.half.low or 0.0) < 1 else " to ".join(dict.fromkeys((low, high)))
         parts.append(f"half of all curvature lies in {among} of {data.counts.active_parameters:,} directions")
-    if ratio and ratio.value is not None and not is_loose(ratio):
-        parts.append(f"participation ratio {rough(ratio.value)}")
+    if ratio and ratio.low is not None and ratio.high is not None and not is_loose(ratio):
+        parts.append(f"participation ratio {extent((ratio.low, ratio.high))}")
     return "; ".join(parts)
 
 

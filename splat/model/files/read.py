@@ -17,10 +17,11 @@ from splat.model.files import quantised, tensor_files
 from splat.model.files.ply import MAGIC, read_header
 from splat.model.files.splat_file import SplatFile
 from splat.model.files.splat_ply import read_splat_ply
+from splat.model.files.tensor_files import ZIP_MAGIC
 from splat.model.plugins import added
 from splat.model.untrusted import require_content, require_modest
 
-ZIP_MAGIC, LICHTFELD = b"PK\x03\x04", (b"LFKP", b"PKFL")
+LICHTFELD = (b"LFKP", b"PKFL")
 LONGEST_SETTINGS = 1 << 16
 SETTINGS = {  # of gsplat and nerfstudio: names in the file in the folder above that of the checkpoint, and here
     "cfg.yml": {name: name for name in ("antialiased", "ssim_lambda", "opacity_reg", "scale_reg")},

@@ -33,6 +33,7 @@ UNAPPLIED = "{}, which changed its images in training, is not applied"
 RANK = re.compile(r"(.*_rank)(\d+)(\.pt)")
 OWN = b"splat-landscape checkpoint"
 WRAPPED = r"(?:(?:module|_orig_mod)\.)*"
+ZIP_MAGIC = b"PK\x03\x04"
 NERFSTUDIO = re.compile(rf"({WRAPPED}_model\.{WRAPPED}(?:gauss_params\.)?)means")
 MOVED = re.compile(r"camera_opt|bil_grid|appearance|exposure")  # in names of further parameters that splatfacto fits
 NUMPY_TYPES = ("Float64DType", "Float32DType", "Int64DType", "Int32DType", "BoolDType")
@@ -86,7 +87,15 @@ def loaded(file: BinaryIO) -> Any:
     except Exception as error:  # a damaged file, or one of another kind, fails in torch in many ways
         if isinstance(error, InputError) or lacks_memory(error) or is_of_the_system(error):
             raise
+        if isinstance(error, zipfile.BadZipFile) and is_archive(file):
+            raise InputError("it is cut off: its end, with the list of what it holds, is missing") from error
         raise InputError(f"torch does not load it: {torch_reason(error)}") from error
+
+
+def is_archive(file: BinaryIO) -> bool:
+    """Whether a file begins as an archive does, though its end may be missing."""
+    file.seek(0)
+    return file.read(len(ZIP_MAGIC)) == ZIP_MAGIC
 
 
 def torch_reason(error: Exception) -> str:

@@ -4,6 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from landscape.errors import did_you_mean
+
+FILE = "checkpoint.pt"  # of a run
+KIND = "expected a checkpoint written by landscape train"
+
 
 @dataclass(frozen=True)
 class Trainer:
@@ -48,3 +53,24 @@ class Foreign(Trainer):
 
 
 OF_ALL = {"scene", "max_views", "accept_changed"}  # fields of `Foreign` that are of our own checkpoints too
+
+
+def require_checkpoint(path: Path) -> None:
+    """FileNotFoundError, which says what to name instead, where no file is at the path of a checkpoint."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{KIND} at {path}, found {_instead(path)}")
+
+
+def _instead(path: Path) -> str:
+    """Description of the thing at path that is no checkpoint, and which path to name instead."""
+    if not path.exists():
+        near = path.parent if path.name == FILE else path
+        beside = [each.name for each in near.parent.iterdir()] if near.parent.is_dir() else []
+        return f"no such file{did_you_mean(near.name, beside) or '; name a run, or a file of Gaussians'}"
+    if (inside := path / FILE).is_file():
+        return f"a folder; name the {inside} in it"
+    if runs := sorted(path.glob("*/checkpoint.pt")):
+        return f"a folder of runs; name one of them, such as {runs[0].parent}"
+    if (path.parent / FILE).is_file():
+        return f"a folder within the run {path.parent}; name that"
+    return "a folder without one; name the run that landscape train wrote, its --out"

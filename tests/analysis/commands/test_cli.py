@@ -221,13 +221,21 @@ def test_options_that_cannot_be_are_refused(original, tmp_path, capsys, options,
 
 
 @pytest.mark.parametrize("options", ["--iterations -5", "--sh-degree 4", "--method stablgs", "--set gama=1"])
-def test_settings_are_refused_before_folders_are_looked_at(tmp_path, capsys, options):
+def test_settings_are_refused_before_folders_are_looked_into(tmp_path, capsys, options):
     (out := tmp_path / "run").mkdir()
-    refuse(
-        capsys,
-        ["train", str(tmp_path / "nothing"), "--out", str(out), *options.split()],
-        options.split()[1].split("=")[0],
-    )
+    refuse(capsys, ["train", str(tmp_path), "--out", str(out), *options.split()], options.split()[1].split("=")[0])
+
+
+@pytest.mark.parametrize(
+    "words", ["train SCENE", "probe a.ply --scene SCENE", "convert a.ply a.pt --scene=SCENE", "map SCENE"]
+)
+def test_a_scene_or_a_checkpoint_that_is_not_there_is_refused_before_libraries_are_loaded(
+    tmp_path, capsys, monkeypatch, words
+):
+    monkeypatch.setattr("analysis.commands.cli.import_module", lambda name: pytest.fail(f"{name} is loaded"))
+    kind = "a checkpoint written by landscape train at" if words.startswith("map") else "a scene folder,"
+    assert main(words.replace("SCENE", str(tmp_path / "gone")).split()) == 2
+    one_sentence(capsys, f"expected {kind} {tmp_path / 'gone'}")
 
 
 def test_training_views_are_listed_in_a_file(original, tmp_path, capsys):
@@ -314,7 +322,9 @@ def test_the_help_has_every_command_once_in_groups_and_theirs_an_example_within_
         said = capsys.readouterr().out
         assert f"Example: landscape {name} {command.example}".rstrip() in " ".join(said.split())
         assert len(said.splitlines()) <= 60, name
-        assert ("--trained-by STR" in said) == (name == "convert"), name  # other commands refer to it
+        assert ("--trained-by STR" in said) == (name == "convert"), name  # others refer to it, but for what most need
+        foreign = name != "convert" and "foreign" in command.options.__dataclass_fields__
+        assert ("--scene FOLDER: the scene on which a file" in said and "--views N or all" in said) == foreign, name
 
 
 def test_a_command_that_there_is_not_is_refused_with_the_one_that_was_meant(capsys):

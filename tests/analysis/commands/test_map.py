@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from msgspec import structs
 from PIL import Image
 
 from analysis.commands.cli import main
@@ -149,7 +150,8 @@ def test_the_distance_to_a_swap_is_drawn_from_far_to_near_and_bright():
     assert far.sum() < near.sum() and near == pytest.approx(
         np.asarray(axes.images[0].get_array())[0, 0] / 255, abs=1 / 255
     )
-    assert "to left" in shade.legend and shade.legend.index("10<") < shade.legend.index("0.10<")
+    assert "to left" in shade.legend and shade.legend.index("≥ 10<") < shade.legend.index("≤ 0.10<")  # others beyond
+    assert not set("≥≤") & set(structs.replace(shade, name="one_view").legend)
 
 
 def test_the_share_in_one_view_has_the_scale_of_what_its_title_says(folder):

@@ -18,6 +18,7 @@ from analysis.probe.settings import ProbeSettings
 from analysis.records.findings import findings
 from analysis.records.json_files import plain
 from analysis.records.page.summary import summary
+from analysis.records.quantities import extent
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.schema import INDICES
 from analysis.records.tables import number_rows
@@ -88,7 +89,7 @@ def test_a_quick_probe_says_what_it_left_out_and_the_files_to_open(run, capsys, 
     assert data.provenance.dtype == "float32" and data.slice.points == 21 * 21
     assert set(dict(data.eigenvalues.items())) == {"max", "second", "min"} and "power iteration" not in said.out
     # what it left out is said, in the record and in the report
-    words = f"no surface is drawn; landscape slice {run / 'checkpoint.pt'} renders more"
+    words = f"no surface is drawn; landscape slice {run} renders more"
     assert any(words in line.text for line in findings(data))
     assert data.depth is None and "positions along and across the rays were left out" in data.notes
     assert data.anisotropy.top_mass.value is None and "density" not in data.timing
@@ -121,6 +122,8 @@ def test_the_summary_says_of_both_ends_what_renders_say_and_who_carries_them(rec
     lines = dict(line.split(maxsplit=1) for line in summary(data, Path("run/probe/report.html")))
     assert "all 4 passed" in lines["checks"] and ">" not in str(lines)
     assert re.match(r"half of all curvature lies in \S+( to \S+)? of [\d,]+ directions", lines["spread"])
+    spread = data.anisotropy.participation_ratio
+    assert lines["spread"].endswith(f"participation ratio {extent((spread.low, spread.high))} (one training)")
     for name, end in (("steepest", data.eigenvalues.max), ("negative", data.eigenvalues.min)):
         steps, least = end.renders.steps, end.renders.optimiser_step
         assert steps == pytest.approx([steps[0] * 2**k for k in range(len(steps))]) and steps[5] == least
@@ -129,7 +132,7 @@ def test_the_summary_says_of_both_ends_what_renders_say_and_who_carries_them(rec
         assert end.carrier.gaussian == int(dense[0].mask.nonzero()[mass, 0])
         assert " of " in end.carrier.shape
         agree = {
-            True: "renders agree within a factor of 2 at steps of",
+            True: "renders agree within a factor of 2 at ",
             False: "not confirmed by renders",
             None: "not resolved",
         }

@@ -71,7 +71,7 @@ def test_a_check_that_failed_leaves_no_number_that_it_puts_in_doubt():
 @pytest.mark.parametrize(
     ("confirmed", "ratio", "said"),
     [
-        (True, 1.5, "renders agree within a factor of 2 at steps of 0.0010 to 0.0040"),
+        (True, 1.5, "renders agree within a factor of 2 at 1/2 to 2 × the optimiser's step"),
         (False, -1.5, "not confirmed by renders, by which it is 330 over the optimiser's step: no saddle is claimed"),
         (None, 1.5, "not resolved: round-off hides it in renders"),
     ],
@@ -89,7 +89,9 @@ def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, wide):
     lines = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))
     over = "one training" if not confirmed else "330 over the optimiser's step in renders; one training"
     assert lines["negative"].startswith("−220 (" + over.replace("330", "−330"))
-    who = "90% on Gaussian 3,739 (of a random direction 0.2%), a needle, 158 : 1 in the picture, turned; "
+    who = (
+        "90% on Gaussian 3,739 (of a random direction 0.2%), most of it in rotation, a needle, 158 : 1 in the picture; "
+    )
     other = "each of the first 10 eigenvectors from this end lies on at most ten Gaussians"
     other = "number 4 from this end (−120) is the first eigenvector on more than ten Gaussians" if wide else other
     assert lines["negative"].endswith(f"{who}{other}; {said}")

@@ -254,6 +254,7 @@ def test_probes_of_other_losses_are_not_compared(runs, capsys, no_pictures):
     assert main(["compare", *runs]) == 0  # both records are of one loss
     said = " ".join(capsys.readouterr().out.split())
     assert "The losses of the trainings are not the same." in said and "The protocol is not the same." in said
+    assert said.index("The protocol is not") < said.index("trace of position")  # before the table
     path = Path(runs[1]) / "probe/probe.json"
     data = json.loads(path.read_text())
     path.write_text(json.dumps(data | {"objective": data["objective"] | {"loss": "L1 + 0.2 (1 − SSIM)"}}))
