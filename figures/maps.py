@@ -24,7 +24,7 @@ from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.ticker import AsinhLocator, FuncFormatter, MaxNLocator, PercentFormatter
 
 from analysis.console.failures import program
-from analysis.records.quantities import BYTES, Shade, percent, quantity, rough
+from analysis.records.quantities import BEYOND, BYTES, Shade, percent, quantity, rough
 from analysis.records.run_files import (
     END_MAPS,
     VIEW_MAPS,
@@ -74,7 +74,7 @@ def show_scaled(axes: Axes, share: UInt8[np.ndarray, "h w"], shade: Shade, title
         ax=axes,
         location="bottom",
         label=literal(label),
-        extend=shade.beyond,
+        extend=BEYOND.get(shade.name, "both"),
         panchor=(0.5, 1.0),
         aspect=30,
         pad=0.03,
@@ -145,11 +145,8 @@ def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
 def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
     """An end of the spectrum: the view with the carriers, and its part at -step, 0 and +step."""
     left, top, right, bottom = end.crop
-    changes, share = (
-        [loss / end.losses[1] - 1 for loss in end.losses],
-        percent(sum(each.share for each in end.carriers)),
-    )
-    back, _, forth = map(_signed, changes)
+    share = percent(sum(each.share for each in end.carriers))
+    back, _, forth = (_signed(loss / end.losses[1] - 1) for loss in end.losses)
     with style():
         figure, places = _sheet(2, 3, maps["view"].shape[:2], 1)
         axes = dict(zip(("view", "photograph", "zero", "minus", "plus", "difference"), places.flat, strict=True))

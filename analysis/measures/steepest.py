@@ -76,7 +76,7 @@ def steepest(
     mass, spread = mass / mass.sum(), participation(mass)
     order = mass.argsort(descending=True, stable=True)[:MOST].tolist()
     chosen = [i for i in order if mass[i] >= LEAST] or order[:1]
-    view = objective.views[_view_with_most(sights, chosen[0])]
+    view = objective.views[int(torch.stack([each.weight[chosen[0]] for each in sights]).argmax())]
     carriers = [_carrier(objective, view, end.vector, values, mass, i) for i in chosen]
     crop = crop_around([each.outline for each in carriers], view.camera.width, view.camera.height)
     step = shown_step(end.renders)
@@ -151,17 +151,17 @@ def heaviest_view(objective: SceneObjective, vector: Float[Tensor, " p"]) -> int
     return int(weights_of(objective)[:, masses(vector, objective.active).argmax()].argmax())
 
 
-def _view_with_most(sights: Sequence[Sight], gaussian: int) -> int:
-    return int(torch.stack([each.weight[gaussian] for each in sights]).argmax())
-
-
 def shown_step(renders: Renders) -> float:
-    """The longest step whose ratio is within AGREES of 1, else the longest with one above 0, else the longest.
+    """The longest step whose ratio is within AGREES of 1, else the longest with one above 0, else the longest; of those that
+    round-off does not hide.
 
-    >>> shown_step(Renders(confirmed=None, steps=[1.0, 2.0, 4.0], ratios=[0.9, 1.1, 0.5], errors=[0.0] * 3))
+    >>> shown_step(Renders(confirmed=None, steps=[1.0, 2.0, 4.0], ratios=[0.9, 1.1, 0.5], errors=[0.1] * 3))
     2.0
+    >>> shown_step(Renders(confirmed=None, steps=[1.0, 2.0, 4.0], ratios=[1.0, None, -2.0], errors=[9.0, None, 0.1]))
+    4.0
     """
-    known = [(step, ratio) for step, ratio in zip(renders.steps, renders.ratios, strict=True) if ratio is not None]
+    found = zip(renders.steps, renders.ratios, renders.errors, strict=True)
+    known = [(step, r) for step, r, error in found if r is not None and error is not None and abs(r) > error]
     tests = (lambda ratio: abs(ratio - 1) <= AGREES, lambda ratio: ratio > 0)
     chosen = [step for fits in tests for step, ratio in reversed(known) if fits(ratio)]
     return next(iter(chosen), renders.steps[-1])

@@ -21,11 +21,8 @@ PLUS_MINUS, TIMES = f"{HARD}±{HARD}", f"{HARD}×{HARD}"
 DIGITS = 3  # significant
 AGREES = 0.2  # largest |ratio - 1| of two numbers that are said to agree
 BYTES, NOTHING = 254, 255  # of a scale in bytes: its upper end, and the code of no value
-BEYOND = {
-    "error": "max",
-    "one_view": "neither",
-    "difference": "neither",
-}  # ends of a scale with values beyond, if not both
+# ends of a scale beyond which values lie, if not both
+BEYOND: dict[str, Any] = {"error": "max", "one_view": "neither", "difference": "neither"}
 GREY = 128  # the colour of no value, in bytes
 SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS (VGG)", "avge": "AVGE"}  # of metrics.json
 PLACES = {"psnr": 2, "ssim": 4, "lpips": 4, "avge": 4}
@@ -270,11 +267,6 @@ class Shade(Struct, frozen=True, kw_only=True):
         return self.name == "order_gap"
 
     @property
-    def beyond(self) -> Any:
-        """Ends of the scale beyond which values lie: they have its colour."""
-        return BEYOND.get(self.name, "both")
-
-    @property
     def palette(self) -> UInt8[np.ndarray, "256 3"]:
         """The colours of `bytes`; grey of no value."""
         from matplotlib import colormaps  # slow to import, and most readers of a record need no colours
@@ -289,7 +281,7 @@ class Shade(Struct, frozen=True, kw_only=True):
         stops = ", ".join(
             "rgb({}, {}, {})".format(*colour) for colour in self.palette[np.linspace(0, BYTES, 9, dtype=int)]
         )
-        signs = {"both": "≤≥", "max": " ≥"}.get(self.beyond, "  ")
+        signs = {"max": " ≥", "neither": "  "}.get(BEYOND.get(self.name, ""), "≤≥")
         ends = [f"{sign} {rough(self.value(t))}".strip() for sign, t in zip(signs, (self.low, self.high), strict=True)]
         way = "right"
         if self.falls:
