@@ -252,8 +252,8 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     from analysis.records.provenance import require_seed  # not for --help
 
     require_seed(getattr(options, "seed", 0))
-    _require_there(options)
     _require_compiler()
+    _require_there(options)
     name, function = command.runs.split(":")
     with ExitStack() as around:
         given = [options, ["landscape", *arguments]] if command.recorded else [options]

@@ -46,8 +46,8 @@ PICTURES = {
 }
 COMPARED = (  # of the traces, where the record has these steps
     "By how much of itself the loss changes in a random step as long as the optimiser's first, which compares; beside the "
-    "names their traces, each in its own unit. Rendered steps change it by more than curvature says: over a whole step L1's "
-    "kinks curve too, splats change their order, and the Hessian sees neither."
+    "names their traces, each in its own unit. Where rendered steps change it by more than curvature says: over a whole step "
+    "L1's kinks curve too and splats change their order, and the Hessian sees neither."
 )
 PIXEL = "1 px along the ray: a way as long as the one that moves a splat by a pixel where it is across the ray."
 GLOSSARY = {  # of the words that a page uses
