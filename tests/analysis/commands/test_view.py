@@ -35,12 +35,13 @@ def viewer(objective):
     server.stop()
 
 
-def test_without_viser_it_says_what_to_install(monkeypatch, capsys):
+def test_without_viser_it_says_what_to_install(monkeypatch, capsys, tmp_path):
     def missing(_: str):
         raise ImportError("No module named 'viser'")
 
     monkeypatch.setattr(command, "import_module", missing)
-    assert main(["view", "nowhere.pt"]) == 2
+    (tmp_path / "checkpoint.pt").touch()
+    assert main(["view", str(tmp_path / "checkpoint.pt")]) == 2
     assert "pip install -e '.[view]'" in capsys.readouterr().err
 
 
