@@ -45,6 +45,8 @@ PLAIN = re.compile(  # names in a pickle that make nothing larger than what the 
     r"torch\.serialization _get_layout|torch\._tensor _rebuild_from_type_v2|numpy\._?core\.multiarray scalar|"
     r"collections (OrderedDict|Counter)|(builtins|__builtin__) (set|complex)"
 )
+# columns of a table
+DIGESTS = dict.fromkeys(["digest", "scene_digest", "commit", "of_data", "of_question", "of_state"], str)
 MOST_TEXT = 2**28  # bytes of a file of text
 DEEPEST = 64  # levels of lists and mappings in one; records have at most ten, and Python takes about 300
 MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
@@ -227,11 +229,16 @@ def read_toml(path: Path, what: str = "TOML") -> dict[str, Any]:
 
 
 def read_table(path: Path, what: str = "a table", **settings: Any) -> "pd.DataFrame":
-    """What `pandas.read_csv` reads with these settings.  InputError, which says what was expected, where it is no CSV."""
+    """What `pandas.read_csv` reads with these settings.  InputError, which says what was expected, where it is no CSV.
+
+    Columns of DIGESTS are text: one of digits and an e would be read as a number, mostly as infinity.
+    """
     import pandas as pd  # a third of a second
 
+    dtype = settings.pop("dtype", {})
     with _refusing(what, path):
-        return pd.read_csv(StringIO(_bytes(path).decode("utf-8")), **settings)
+        text = StringIO(_bytes(path).decode("utf-8"))
+        return pd.read_csv(text, dtype=dtype if dtype is str else DIGESTS | dtype, **settings)
 
 
 def unpacked(content: bytes | msgspec.Raw, kind: type[T], decode_hook: Callable[[type, Any], Any] | None = None) -> T:

@@ -117,7 +117,10 @@ def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
         (["accuracy", "nowhere/checkpoint.pt"], "expected a checkpoint"),
     ],
 )
-def test_bad_input_gets_one_sentence(tmp_path, capsys, arguments, message):
+def test_bad_input_gets_one_sentence(tmp_path, capsys, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "checkpoint.pt").touch()  # a missing one is refused before
     assert main(["bench", *arguments, "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err.strip()
     assert said.startswith("landscape: ") and message in said and "\n" not in said

@@ -17,6 +17,7 @@ from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
+from splat.model.untrusted import read_table
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
@@ -43,7 +44,7 @@ def probed(scene: Path, out: str, *more: str) -> list[str]:
 
 
 def rows(run: Path) -> pd.DataFrame:
-    return pd.read_csv(run / "trajectory.csv")
+    return read_table(run / "trajectory.csv")
 
 
 @pytest.fixture(scope="module")

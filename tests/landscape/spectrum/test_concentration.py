@@ -36,7 +36,7 @@ def test_the_brackets_hold_as_often_as_they_say(name):
     H, runs, held = DenseOperator((Q * values) @ Q.T), 20, np.zeros(3)
     for seed in range(runs):
         generator = torch.Generator().manual_seed(seed)
-        ends = extreme_eigenpairs(H, generator, EigenSettings(2, 1))
+        ends = extreme_eigenpairs(H, generator, EigenSettings(2, 1, max_matvecs=60))
         density = spectral_density(H, generator, 72, ends=ends, trace=(float(values.sum()), 0.0))
         found = half(density), top(density, 10), top(density, 100)
         held += [each.low <= true <= each.high for each, true in zip(found, truth(values), strict=True)]

@@ -104,6 +104,11 @@ def test_what_is_none_is_refused_in_a_sentence_that_names_the_file(tmp_path, rea
         read(tmp_path / "none")
 
 
+def test_a_digest_that_looks_like_a_number_stays_what_it_is(tmp_path):
+    (tmp_path / "file").write_text("at,digest,commit\n30,97351657e9409972,012345678912\n")
+    assert read_table(tmp_path / "file").loc[0].tolist() == [30, "97351657e9409972", "012345678912"]
+
+
 @pytest.mark.parametrize("content", ["[" * 10**5, "9" * 6000, "{", '{"a": 01}'])
 def test_json_of_other_tools_is_read_as_python_does_or_refused(content):
     assert loose_json('{"a": NaN, "b": 3}', parse_int=float)["b"] == 3.0
