@@ -4,6 +4,8 @@ new poses           the cameras of the views that were held out, POSES of them s
 order fragility     `splat.curvature.scores.new_poses`
 field sharpness     `splat.curvature.scores.field_sharpness`, with a correlation over LENGTH of the scene's size
 critical sharpness  `landscape.critical_sharpness` along Adam's next update
+Adam's sharpness    the largest eigenvalue of D H D, D^2 = rate / (sqrt(v_hat) + eps): H as Adam scales its next update.  Full
+                    steps with momentum beta1 oscillate where it is beyond (2 + 2 beta1) / (1 - beta1) = 38 (arXiv 2207.14484)
 open curvature      `splat.curvature.scores.new_poses`
 
 They are made on the CPU, each with the same draws for every checkpoint.
@@ -15,9 +17,11 @@ import torch
 
 from analysis.measures.units import scene_size
 from analysis.records.schema import Number
-from landscape import critical_sharpness
+from landscape import EigenSettings, critical_sharpness, extreme_eigenpairs
+from landscape.operators.operator import ScaledOperator
 from landscape.results import Measured, Progress, finite_or_none
-from splat.backend.cpu.adam import BETA1
+from splat.backend.cpu.adam import BETA1, EPS, bias_corrections
+from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.field_sharpness import field_sharpness
 from splat.curvature.scores.new_poses import open_curvature, order_fragility
@@ -46,7 +50,7 @@ def measures(
     new = new_poses(subject)
 
     def begun(name: str) -> torch.Generator:
-        progress(len(found), 7, name.replace("_", " "))
+        progress(len(found), 8, name.replace("_", " "))
         return torch.Generator().manual_seed(seed)
 
     for name, poses in {"order_fragility": seen, "order_fragility_new": new}.items():
@@ -55,8 +59,7 @@ def measures(
     length, name = LENGTH * scene_size(objective), "field_sharpness"
     field = field_sharpness(gaussians, objective, new if new.cameras else seen, length, begun(name))
     found |= {name: field.loss} | ({f"{name}_new": field.images} if new.cameras else {})
-    begun("critical_sharpness")
-    found["critical_sharpness"] = along_the_update(objective, training)
+    found |= sharpness_of_adam(objective, training, begun("critical_sharpness"))
     if new.cameras:
         begun("open_curvature")
         opened, ratio = open_curvature(gaussians, seen, new)
@@ -73,21 +76,29 @@ def new_poses(subject: Subject) -> Poses:
     return Poses(cameras, config.background_colour(flat.dtype), config.render)
 
 
-def along_the_update(objective: SceneObjective, training: Training) -> Measured:
-    """Critical sharpness along Adam's next update, with the gradient of all training views for its first moment too.
+def sharpness_of_adam(objective: SceneObjective, training: Training, generator: torch.Generator) -> dict[str, Measured]:
+    """critical_sharpness and adam_sharpness of Adam's next update, with the gradient of all training views.
 
-    Along a momentum of single views the loss need not fall, and the sharpness is then undefined; so it is without moments.
+    It is the first moment too: along a momentum of single views the loss need not fall, and critical sharpness is then
+    undefined.  Both are nan without moments.
     """
-    second, updates = training.adam.second.select(objective.mask), training.adam.updates
-    if updates == 0:
-        return Measured(nan, nan)
-    active = training.gaussians.select(objective.mask)  # as stored, quaternions too: the moments are of these
-    at, count, gradient = objective.linearizer(active), len(objective.views), torch.zeros_like(active.flat)
-    for index in range(count):
-        gradient += at(index).gradient / count
+    active, moments = training.gaussians.select(objective.mask), training.adam  # as stored, quaternions too
+    if moments.updates == 0:
+        return dict.fromkeys(("critical_sharpness", "adam_sharpness"), Measured(nan, nan))
+    # L does not see the length of a quaternion: of length q it has 1 / q of the gradient at length 1, 1 / q^2 of H
+    lengths = active.with_flat(torch.ones_like(active.flat))
+    lengths.quats.mul_(active.quats.norm(dim=1, keepdim=True))
+    gradient = objective.gradient / lengths.flat
     rates = training.gaussians.with_flat(training.rates(training.step)).select(objective.mask).flat
-    first = active.with_flat(gradient * (1 - BETA1**updates))  # of so many equal gradients
-    after = active.flat.clone()
-    Adam(first, second, updates).update(after, gradient, rates)
+    first = active.with_flat(gradient * (1 - BETA1**moments.updates))  # of so many equal gradients
+    adam, after = Adam(first, moments.second.select(objective.mask), moments.updates), active.flat.clone()
+    adam.update(after, gradient, rates)
     step = active.flat - after
-    return critical_sharpness(objective.loss, active.flat, step, float(gradient.double() @ step.double()))
+    critical = critical_sharpness(objective.loss, active.flat, step, float(gradient.double() @ step.double()))
+    # v of this update: with the old one, what was out of sight and now is in sight would move without bound
+    v, (root, _) = adam.second.flat, bias_corrections(adam.updates)
+    D = torch.where(v > 0, (rates / (v.sqrt() / root + EPS)).sqrt(), 0.0)  # without a moment nothing moves
+    scaled = ScaledOperator(SceneHessian(objective, keep_null=True), D / lengths.flat)
+    largest = extreme_eigenpairs(scaled, generator, EigenSettings(smallest=0, rtol=0.01)).largest
+    sharpness = Measured(float(largest.values[0]), float(largest.residuals[0]))
+    return {"critical_sharpness": critical, "adam_sharpness": sharpness}

@@ -45,7 +45,7 @@ class ProbeOptions:
     parameters: as stored.  scene: positions in units of the scene's size.
     optimiser: in units of the first step's learning rates."""
     measures: bool = False
-    """Also order fragility, field sharpness, critical sharpness and open curvature, at the training views and at the
-    cameras of those held out, in an eighth of a probe's time."""
+    """Also order fragility, field sharpness, critical sharpness, that of Adam's own scaling, and open
+    curvature, at the training views and at the cameras of those held out, in an eighth of a probe's time."""
     memory: MostMemory = None
     foreign: OtherTools = field(default_factory=Foreign)

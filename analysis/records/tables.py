@@ -40,6 +40,7 @@ MEASURES = {
     "order_fragility": "mean change of a colour when depths change by 1% at random, which only the order of Gaussians sees",
     "field_sharpness": "rise of the loss, at new poses change of a colour, by a random field over the Gaussians",
     "critical_sharpness": "2 / η; η: of the optimiser's next step, at which the loss is again what it is now",
+    "adam_sharpness": "largest eigenvalue as the optimiser scales its next step; full steps oscillate beyond 38",
     "open_curvature": "mean variance of a pixel of new poses that the training views leave open",
     "open_ratio": "the same over that at the training poses",
 }
