@@ -143,7 +143,7 @@ def what_renders_say(value: float, renders: schema.Renders) -> str:
         steps = optimiser_steps(renders, renders.low or 0.0, renders.high or 0.0)
         return f"renders agree within a factor of 2 at {steps}"
     if renders.confirmed is None:
-        return "not resolved: round-off hides it in renders"
+        return f"not resolved: round-off hides it in renders at up to {optimiser_steps(renders, renders.hidden)}"
     why = ""
     if renders.kinks > abs(value):
         why = f", as kinks of L1, which the eigenvalue leaves out, curve by {rough(renders.kinks)}"

@@ -161,6 +161,13 @@ class Renders(Struct, kw_only=True):
         ratio, error = self.ratios[i], self.errors[i]
         return ratio if ratio is not None and error is not None and abs(ratio) > error else None
 
+    @property
+    def hidden(self) -> float:
+        """The longest step of which round-off leaves open whether its ratio is of 1/2 to 2; 0 without one."""
+        numbers = zip(self.steps, self.ratios, self.errors, strict=True)
+        known = [(step, ratio, error) for step, ratio, error in numbers if ratio is not None and error is not None]
+        return max((d for d, r, e in known if r - e < 2 and r + e >= 0.5 and not max(e, 0.5) < r < 2), default=0.0)
+
 
 class Carries(Struct, kw_only=True):
     """The Gaussian with most mass in an eigenvector.

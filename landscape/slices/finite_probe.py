@@ -10,7 +10,8 @@ confirmed   a step where c(d) is beyond its round-off, has the sign of v.H v, an
             confirmed by three such steps, each twice the one before: the curvature 2 |d| / d^2 of a kink is halved from one to
             the next, so that it never is
 refuted     a step where no value within the round-off of c(d) is such.  Round-off grows as 1 / d^2, and hides the
-            shortest steps of any loss: it leaves a curvature open only where no longer step refutes it
+            shortest steps of any loss: it leaves a curvature open only where no longer step refutes it, or where steps beside
+            those that it hides confirm it
 noise       standard deviation of the error of one value of L, from differences of order k = 4 of values at small even steps
             along v, in which the smooth part of L cancels: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and
             Wild 2011, Sec. 2).  At least the resolution of the numbers that the objective returns (Python floats that are all
@@ -71,15 +72,17 @@ class FiniteProbe(ShortRepr):
     def confirmation(self, least: float) -> tuple[bool | None, tuple[float, float] | None]:
         """Whether renders, say, confirm v.H v, and the shortest and longest of the steps that do; steps double.
 
-        True where RUN consecutive steps, the longest of at least `least`, confirm it; else False where a step of at least
-        `least` refutes it, and None where round-off hides it at all of these that do not confirm it.
+        True where RUN consecutive steps, the longest of at least `least`, confirm it; None where without round-off they might:
+        some of them do and none refutes it, or no step of at least `least` refutes it; else False.
         """
         ratio, error = self.curvatures / self.infinitesimal, self.round_off / abs(self.infinitesimal)
         good = (ratio >= 1 / WITHIN) & (ratio < WITHIN) & (ratio > error)
         refuted = ~((ratio + error >= 1 / WITHIN) & (ratio - error < WITHIN))
-        runs = [i for i in range(RUN - 1, len(ratio)) if self.steps[i] >= least and good[i - RUN + 1 : i + 1].all()]
+        ends = [i for i in range(RUN - 1, len(ratio)) if self.steps[i] >= least]
+        runs = [i for i in ends if good[i - RUN + 1 : i + 1].all()]
         if not runs:
-            return (False if refuted[self.steps >= least].any() else None), None
+            begun = (good[i - RUN + 1 : i + 1].any() and not refuted[i - RUN + 1 : i + 1].any() for i in ends)
+            return (None if any(begun) or not refuted[self.steps >= least].any() else False), None
         first = last = runs[-1]
         while first and good[first - 1]:
             first -= 1

@@ -89,6 +89,16 @@ def test_what_a_resolved_step_refutes_is_not_confirmed_however_many_shorter_ones
     )
 
 
+def test_round_off_beside_steps_that_confirm_leaves_a_curvature_open():
+    # without noise the first four steps confirm it; noise hides the first two
+    quartic = lambda t: 1 + t**2 + 1.1 * t**4 / DOUBLING[4] ** 2  # noqa: E731
+    assert judged(quartic) == (True, (DOUBLING[0], DOUBLING[3]))
+    random, noise = np.random.default_rng(0), DOUBLING[2] ** 2 / 12
+    noisy = lambda t: quartic(t) + noise * random.standard_normal()  # noqa: E731
+    assert judged(noisy) == (None, None)
+    assert judged(noisy, least=DOUBLING[6]) == (False, None)
+
+
 def test_the_measured_noise_is_unbiased():
     values = np.random.default_rng(1).standard_normal((2000, NOISE_POINTS)) + 3 * np.arange(NOISE_POINTS) ** 3
     squares = np.array([evaluation_noise(row) ** 2 for row in values])
