@@ -74,12 +74,13 @@ def _to_own(options: ConvertOptions) -> list[str]:
 def _to_tool(options: ConvertOptions, to: str) -> list[str]:
     found, seen = _foreign(options) if is_foreign(options.source) else own_file(load_checkpoint(options.source))
     extra: Mapping[str, np.ndarray] = found.extra
+    width = found.settings.get("resolution")
+    said = {"antialiased": found.antialiased, "train": found.train, "width": width if isinstance(width, int) else None}
     if to == "graphdeco":
         gaussians = found.gaussians
-        content = splat_ply(gaussians, extra, found.tool, antialiased=found.antialiased, train=found.train)
+        content = splat_ply(gaussians, extra, found.tool, **said)
     else:
         gaussians = baked(found.gaussians)
-        said = {"antialiased": found.antialiased, "train": found.train}
         content = gsplat_bytes(gaussians, found.step or 0, extra, found.tool, **said)
     write_atomically(options.out, content)
     kept = [f"with {', '.join(extra)}"] if extra else []
@@ -151,5 +152,6 @@ def own_file(checkpoint: Checkpoint) -> tuple[SplatFile, Seen]:
     antialiased = seen.render.antialias != "none"
     tool = next((name for name in OURS if seen.is_that_of(name, antialiased=antialiased)), None)
     notes = () if shift is None else (shift_in_words(shift),)
-    said = {"antialiased": antialiased, "train": tuple(scene.train), "notes": notes}
+    width = max(width for width, _ in scene.sizes)
+    said = {"antialiased": antialiased, "train": tuple(scene.train), "notes": notes, "settings": {"resolution": width}}
     return SplatFile(training.gaussians, OURS[0], tool, training.step, **said), seen

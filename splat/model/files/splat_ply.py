@@ -33,6 +33,7 @@ COMMENTS = {
 }
 ANTIALIASED = re.compile(r"^(splatrendermode: mip|antialiased 1)$", re.I)
 TRAINED_BY, TRAINED_ON = "trained by ", "training views "  # our own comments; the names as a list in JSON
+WIDTH = re.compile(r"^training pictures (\d{2,6}) px wide$", re.M)  # another
 
 
 def read_splat_ply(content: bytes) -> SplatFile:
@@ -48,7 +49,7 @@ def read_splat_ply(content: bytes) -> SplatFile:
         "sh": _harmonics(rows),
     }
     widths = _columns(rows, ["filter_3D"])[:, 0] if "filter_3D" in rows.names else None
-    plain = "f_dc_0" not in rows.names
+    plain, width = "f_dc_0" not in rows.names, WIDTH.search("\n".join(header.comments))
     further = [name for name in rows.names if name not in KNOWN and not NAMED.fullmatch(name)]
     return SplatFile(
         packed(attributes, widths),
@@ -57,6 +58,7 @@ def read_splat_ply(content: bytes) -> SplatFile:
         antialiased=widths is not None or any(ANTIALIASED.match(line.strip()) for line in header.comments),
         lossy=plain,
         train=_train(header),
+        settings={"resolution": int(width[1])} if width else {},
         extra={name: rows.numbers[name].astype(np.float32) for name in further},
         notes=(*(("it has plain colours and no spherical harmonics",) if plain else ()), *notes),
     )
@@ -131,11 +133,12 @@ def splat_ply(
     *,
     antialiased: bool = False,
     train: Sequence[str] = (),
+    width: int | None = None,
 ) -> bytes:
     """A file with graphdeco's properties in graphdeco's order, float32, and then those of `extra`, (n,) each by name.
 
     Gaussians with a 3-D filter get Mip-Splatting's property for it too.  tool, antialiased, train (names of the training
-    views): for the comments, of which the second is Postshot's.
+    views), width (of their pictures, px): for the comments, of which the second is Postshot's.
 
     InputError where a further property has the name of one of the Gaussians', or another length.
     """
@@ -162,4 +165,5 @@ def splat_ply(
     for name, column in columns.items():
         rows[name] = column
     comments = {f"{TRAINED_BY}{tool}": tool, "antialiased 1": antialiased, f"{TRAINED_ON}{json.dumps([*train])}": train}
+    comments[f"training pictures {width} px wide"] = width
     return ply_bytes(rows, [line for line, wanted in comments.items() if wanted])

@@ -218,6 +218,7 @@ def _gsplat(ranks: list[Any]) -> SplatFile:
         antialiased=first.get("antialiased") is True,
         extra=extra,
         train=names_of(first.get("training_views")),
+        settings={"resolution": first["training_width"]} if isinstance(first.get("training_width"), int) else {},
         notes=notes,
     )
 
@@ -230,9 +231,10 @@ def gsplat_bytes(
     *,
     antialiased: bool = False,
     train: Sequence[str] = (),
+    width: int | None = None,
 ) -> bytes:
-    """A checkpoint as gsplat's `simple_trainer` writes it; beside that lie extra, (n,) each by name, tool, antialiased, and
-    train, the names of the training views."""
+    """A checkpoint as gsplat's `simple_trainer` writes it; beside that lie extra, (n,) each by name, tool, antialiased, train,
+    the names of the training views, and width, px of their pictures."""
     values = {name: value.detach().cpu().float().clone() for name, value in gaussians.attributes.items()}
     splats = {
         "means": values["means"],
@@ -251,6 +253,8 @@ def gsplat_bytes(
         content["antialiased"] = True
     if train:
         content["training_views"] = list(train)
+    if width:
+        content["training_width"] = width
     buffer = io.BytesIO()
     torch.save(content, buffer)
     return buffer.getvalue()

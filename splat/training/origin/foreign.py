@@ -118,13 +118,13 @@ def _scene(found: SplatFile, ask: Foreign, preset: Preset) -> tuple[Scene, str |
     background = WHITE if found.settings.get("white_background") is True else None
     downscale = 1.0 if ask.downscale is None else ask.downscale
     scene = load_scene(ask.scene, images, downscale, background)
-    if ask.downscale is None and preset.widest is not None:
+    if ask.downscale is None:
         width = max(frame.camera.width for frame in scene.frames)
         if isinstance(resolution, int) and resolution in (1, 2, 4, 8):
             downscale = float(resolution)
         elif isinstance(resolution, int | float) and 0 < resolution < width:
             downscale = width / resolution
-        elif width > preset.widest:
+        elif preset.widest is not None and width > preset.widest:
             downscale = width / preset.widest
         if downscale > 1:
             scene = load_scene(ask.scene, images, downscale, background)

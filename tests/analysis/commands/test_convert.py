@@ -159,6 +159,19 @@ def test_what_a_file_says_of_its_renderer_goes_with_it(folder, capsys):
     )
 
 
+@pytest.mark.parametrize("to", ["graphdeco", "gsplat"])
+def test_a_file_of_ours_is_read_with_pictures_of_the_size_that_it_was_trained_on(folder, to):
+    small = load_scene(folder / "scene", downscale=2)
+    split = split_scene(small)
+    training = Training.start(MADE.truth, small.extent(split.train), TrainConfig())
+    save_checkpoint(folder / "own.pt", training, SceneReference.to(small, folder / "own.pt", split, None, 2.0))
+    assert convert(folder / "own.pt", folder / "one", "--to", to) == 0
+    assert convert(folder / "one", folder / "other.ply") == 0
+    for name in ("one", "other.ply"):
+        assert convert(folder / name, folder / f"{name}.pt", "--scene", folder / "scene") == 0
+        assert set(load_checkpoint(folder / f"{name}.pt").scene.sizes) == {(12, 8)}
+
+
 def test_own_depths_are_read_by_the_training_that_is_suggested(folder, tmp_path, capsys):
     train = ["train", str(folder / "scene"), "--iterations", "1", "--out"]
     assert main([*train, str(tmp_path / "run"), "--downscale", "3.6"]) == 0  # 24 x 16 px become 7 x 4
