@@ -144,12 +144,17 @@ def what_renders_say(value: float, renders: schema.Renders) -> str:
         return f"renders agree within a factor of 2 at {steps}"
     if renders.confirmed is None:
         return f"not resolved: round-off hides it in renders at up to {optimiser_steps(renders, renders.hidden)}"
-    why = ""
-    if renders.kinks > abs(value):
+    ratio, why = renders.at_step, ""
+    if renders.kinks > abs(value) and (ratio is None or ratio * value > value):
         why = f", as kinks of L1, which the eigenvalue leaves out, curve by {rough(renders.kinks)}"
-    elif (ratio := renders.at_step) is not None:
+    elif ratio is not None:
         why = f", by which it is {rough(ratio * value)} over the optimiser's step"
-    return f"not confirmed by renders{why}" + (": no saddle is claimed" if value < 0 else "")
+    falls = (
+        ": they fall too, but not as it says, and no saddle is claimed"
+        if ratio and ratio > 0
+        else ": no saddle is claimed"
+    )
+    return f"not confirmed by renders{why}" + (falls if value < 0 else "")
 
 
 def _of_ends(data: ProbeRecord) -> list[Line]:

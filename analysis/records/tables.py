@@ -252,7 +252,7 @@ def bracketed(index: Index | None) -> Cell:
         return Cell(f"≥ {quantity(low)}" if high is None else f"≤ {quantity(high)}", "", note)
     if value is not None and low <= value <= high and high - low < NARROW * abs(value):
         return Cell(measured(value, max(high - value, value - low)), "", note)
-    return Cell(UNDETERMINED if is_wide(index) else rough(value), limits(low, high), note)
+    return Cell(UNDETERMINED if is_wide(index) else quantity(value), limits(low, high), note)
 
 
 def factor(effect: Effect | None) -> Cell:

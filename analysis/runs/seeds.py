@@ -152,7 +152,7 @@ def _verdict(rows: Sequence[Row], i: int, label: str, first: str, *, seeds: bool
             assert isinstance(here.value, float) and isinstance(there.value, float)
             votes[label if (here.value - there.value) * MORE[row.name] > 0 else first].append(row.name)
     why = [] if seeds else [
-        "one training of each says nothing of other seeds (landscape sweep trains them; give the folders that hold them)"
+        "a single training of one says nothing of other seeds (landscape sweep trains them; give the folders that hold them)"
     ]  # fmt: skip
     if uneven := _uneven(rows, i):
         why.append(uneven)

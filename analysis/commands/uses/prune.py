@@ -222,7 +222,7 @@ def lost(curve: pd.DataFrame, removed: float, steps: int, column: str) -> pd.Dat
 
 
 def verdict(losses: pd.DataFrame) -> str:
-    """What the losses by seed say of the best score of exact curvature and of opacity, by Student's interval of 95%.
+    """What the losses by seed say of the best score of exact curvature and of the best other, by Student's interval of 95%.
 
     >>> seeds = pd.DataFrame({name: [1.0, 1.0] for name in SCORES} | {"removal_error": [0.2, 0.3], "opacity": [0.6, 0.8]})
     >>> verdict(seeds), verdict(seeds[:1])
@@ -231,12 +231,14 @@ def verdict(losses: pd.DataFrame) -> str:
     ['loses', '0.0505', '±', '0.0064', 'dB']
     """
     by = {name: losses[name].to_numpy(float) for name in SCORES}
-    best, n = min(EXACT, key=lambda name: float(by[name].mean())), len(losses)
-    gain, deviation = _over_seeds(by["opacity"] - by[best])
+    best, other = (
+        min(names, key=lambda name: float(by[name].mean())) for names in (EXACT, [x for x in SCORES if x not in EXACT])
+    )
+    n, (gain, deviation) = len(losses), _over_seeds(by[other] - by[best])
     error = t_quantile(n - 1, 0.95) * deviation / n**0.5 if deviation is not None else 0.0
     if abs(gain) <= error:
-        return f"{best} and opacity: undecided over {n} seeds"
-    return f"{best} loses {quantity(abs(gain), error)} dB {'less' if gain > 0 else 'more'} than opacity"
+        return f"{best} and {other}: undecided over {n} seeds"
+    return f"{best} loses {quantity(abs(gain), error)} dB {'less' if gain > 0 else 'more'} than {other}"
 
 
 def _over_seeds(values: Float64[np.ndarray, " n"]) -> tuple[float, float | None]:

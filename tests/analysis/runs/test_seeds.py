@@ -90,7 +90,7 @@ def test_a_verdict_names_the_indices_that_differ_by_more_than_the_seeds():
 def test_one_training_of_each_decides_nothing():
     told = sayings(grouped([row("anisotropy", SHARE, 0.1, 0.2, half=0.001)], SINGLE), SINGLE)
     assert len(told) == 1 and told[0].startswith(
-        "Undecided which of sam and plain is the more anisotropic, because one training"
+        "Undecided which of sam and plain is the more anisotropic, because a single training of one"
     )
 
 
