@@ -27,12 +27,19 @@ from analysis.measures.units import Metric, optimiser_units, scene_size, scene_u
 from analysis.records import schema
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord
-from landscape import BlockAnisotropy, BlockAnisotropySettings, Bracket, ScaledOperator, block_anisotropies
+from landscape import (
+    BlockAnisotropy,
+    BlockAnisotropySettings,
+    Bracket,
+    RestrictedOperator,
+    ScaledOperator,
+    block_anisotropy,
+)
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.probes import spawn
 from landscape.results import Progress, finite_or_none
-from landscape.spectrum.block_anisotropy import WHOLE, WarmStart
+from landscape.spectrum.block_anisotropy import WHOLE
 from landscape.traces.trace import total_trace
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
@@ -210,14 +217,13 @@ def _of_operator(
             continue
         report(done, len(names), name)
 
-        def say(_: int, __: int, state: str, done: int = done) -> None:
-            report(done, len(names), state)
+        def say(_: int, __: int, state: str, done: int = done, name: str = name) -> None:
+            report(done, len(names), f"{name}: {state}")
 
-        dim = hessian.dim if name == WHOLE else hessian.blocks[name].stop - hessian.blocks[name].start
-        lead = WarmStart(_start(hessian, name, scale, ends), traces.get(name))
-        found.append(
-            (name, dim, block_anisotropies(operator, stream, settings, [name], spaces, say, {name: lead})[name])
-        )
+        part = operator if name == WHOLE else RestrictedOperator(operator, name)
+        start = _start(hessian, name, scale, ends)
+        family = block_anisotropy(part, spawn(stream), settings, spaces.get(name), say, start, traces.get(name))
+        found.append((name, part.dim, family))
     report(len(names), len(names), "done")
     return found
 
