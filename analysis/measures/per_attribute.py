@@ -73,13 +73,12 @@ class PerAttributeOptions:
 
 @dataclass(frozen=True, eq=False)
 class FamilyRow:
-    """One family.  dim: rows of the block, its null space included (see `BlockAnisotropy.rank`)."""
+    """One family."""
 
     scene: SceneName
     operator: schema.Operator
     block: str
     gaussians: int
-    dim: int
     family: BlockAnisotropy
 
     def record(self, metric: Metric, unit: str) -> schema.BlockAnisotropy:
@@ -91,15 +90,11 @@ class FamilyRow:
             block=self.block,
             split=self.scene == "split",
             gaussians=self.gaussians,
-            dim=self.dim,
             rank=found.rank,
             lambda_max=convert(ends.largest.record(), schema.End),
             lambda_min=convert(ends.smallest.record(), schema.End),
             beyond=finite_or_none(ends.beyond),
             indices=convert(found.indices.record(), schema.Anisotropy),
-            starts=len(found.density.nodes),
-            steps=found.density.nodes.shape[1],
-            matvecs=ends.matvecs + found.density.matvecs,
         )
 
 
@@ -120,11 +115,7 @@ class FamilyFindings:
         if split := self.control:
             psnr = split.psnr if split.rms else None
             control = schema.SplitControl(
-                gaussians=len(split.gaussians),
-                rms=split.rms,
-                largest=split.largest,
-                psnr=psnr,
-                effects=list(self.effects),
+                gaussians=len(split.gaussians), rms=split.rms, psnr=psnr, effects=list(self.effects)
             )
         return structs.replace(
             record, per_attribute=families, split_control=control, notes=[*record.notes, *self.notes]
@@ -167,7 +158,7 @@ def measure_per_attribute(
             known = ends if scene == "trained" and operator == "hessian" and D is None else None
             measured = _of_operator(hessian, D, known, options, stream, report, notes)
             count = len(scenes[scene].active)
-            rows += [FamilyRow(scene, operator, block, count, dim, found) for block, dim, found in measured]
+            rows += [FamilyRow(scene, operator, block, count, found) for block, found in measured]
     return FamilyFindings(tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)), options.metric, unit)
 
 
@@ -202,8 +193,8 @@ def _of_operator(
     generator: torch.Generator,
     report: Progress,
     notes: list[str],
-) -> list[tuple[str, int, BlockAnisotropy]]:
-    """(block, dim, family) of the whole and of every attribute of one operator.
+) -> list[tuple[str, BlockAnisotropy]]:
+    """(block, family) of the whole and of every attribute of one operator.
 
     ends: of the whole, where known.  notes: gets sentences on what was left out.
     """
@@ -223,7 +214,7 @@ def _of_operator(
         part = operator if name == WHOLE else RestrictedOperator(operator, name)
         start = _start(hessian, name, scale, ends)
         family = block_anisotropy(part, spawn(stream), settings, spaces.get(name), say, start, traces.get(name))
-        found.append((name, part.dim, family))
+        found.append((name, family))
     report(len(names), len(names), "done")
     return found
 

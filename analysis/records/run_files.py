@@ -174,15 +174,14 @@ class Swaps(Struct, kw_only=True):
 class Fragility(Struct, kw_only=True):
     """The three axes (`analysis.measures.fragility`).  Shares are of the Gaussians in sight, or of a trace where it says so.
 
-    condition: percentile -> condition number.  needles: share that are; needles_steepest: share of the steepest hundredth in an
-    attribute that are; needles_trace: share of an attribute's curvature that they hold.  one_view: share that one view alone
-    sees, one_view_trace: share of opacity's curvature on these, opacity_one_view: rank correlation of a Gaussian's curvature in
-    opacity with the share of its weight that one view alone sees; None where all have the same.  depth_gradient: of the
-    positions' gradient along the rays over one direction across them (`analysis.measures.depth`).
+    needles: share that are; needles_steepest: share of the steepest hundredth in an attribute that are; needles_trace: share of
+    an attribute's curvature that they hold.  one_view: share that one view alone sees, one_view_trace: share of opacity's
+    curvature on these, opacity_one_view: rank correlation of a Gaussian's curvature in opacity with the share of its weight
+    that one view alone sees; None where all have the same.  depth_gradient: of the positions' gradient along the rays over one
+    direction across them (`analysis.measures.depth`).
     """
 
     swaps: Swaps
-    condition: dict[str, float]
     needles: float
     needles_steepest: dict[str, float]
     needles_trace: dict[str, float]
