@@ -19,7 +19,7 @@ from msgspec import Meta, Struct
 
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.json_files import read_json, with_remedy
-from analysis.records.provenance import Machine, Provenance
+from analysis.records.provenance import Provenance
 from analysis.records.quantities import Shade
 from analysis.records.schema import INDICES, Count, NonNegative, Number, Portion
 from landscape.errors import InputError
@@ -77,15 +77,6 @@ class Seconds(Struct):
     peak: int | None = None
 
 
-class Made(Struct, kw_only=True):
-    """Time, machine, code, and what the numbers are about, as in `Provenance`."""
-
-    created: str = ""
-    machine: Machine | None = None
-    commit: str | None = None
-    fingerprint: Fingerprint | None = None
-
-
 class Scores(Struct, kw_only=True):
     """Scores of a training; test: None without held-out views."""
 
@@ -93,7 +84,7 @@ class Scores(Struct, kw_only=True):
     train: ViewScores | None = None
     test: ViewScores | None = None
     seconds: Seconds | None = None
-    provenance: Made | None = None
+    provenance: Provenance | None = None
 
 
 class Comparison(Struct, kw_only=True):
