@@ -25,7 +25,6 @@ from splat.model.files.splat_ply import splat_ply
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, open_subject, save_checkpoint
-from splat.training.methods.sam import SAM
 from splat.training.origin.fingerprint import FORMULAS
 from tests.figures.test_trajectory_figure import rows
 from tests.recorded import depth_section, long_numbers, own, synthetic, written
