@@ -123,7 +123,7 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
         "round_off": {"value": 0.0, "bound": 1e-6, "passed": True},
         "finite_difference": skipped,
     }
-    loss = {"loss": "0.8 L1 + 0.2 (1 - SSIM)", "operator": "hessian", "value": 0.0832, "gradient_norm": 0.41}
+    loss = {"loss": "0.8 L1 + 0.2 (1 - SSIM)", "value": 0.0832, "gradient_norm": 0.41}
     data = {"objective": loss, "traces": traces, "eigenvalues": ends, "anisotropy": indices, "slice": _plane(scale)}
     data |= {"counts": counts, "checks": checks, "notes": ["SH bands 1 to 3 are not in use and were left out"]}
     data["timing"] = {"load": 0.4, "linearise": 0.9, "traces": 8.2, "eigenvalues": 21.5, "slice": 14.0, "total": 45.0}
