@@ -11,10 +11,13 @@ from tests.landscape.spectra import N, eigenvalues, generator, operator
 BLOCKS = {"a": slice(0, 50), "b": slice(50, N)}
 
 
-def families(H, settings: BlockAnisotropySettings = BlockAnisotropySettings()) -> dict[str, BlockAnisotropy]:
+def families(H, settings: BlockAnisotropySettings | None = None) -> dict[str, BlockAnisotropy]:
     """Of the whole and of every block."""
     parts, stream = {"all": H} | {name: RestrictedOperator(H, name) for name in H.blocks if name != "all"}, generator()
-    return {name: block_anisotropy(part, spawn(stream), settings) for name, part in parts.items()}
+    return {
+        name: block_anisotropy(part, spawn(stream), settings or BlockAnisotropySettings())
+        for name, part in parts.items()
+    }
 
 
 def blocked(name="both tails"):
