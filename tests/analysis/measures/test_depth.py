@@ -153,7 +153,7 @@ def test_rises_are_those_of_the_loss_of_each_view():
     assert tuple(rise.pixels for rise in found) == steps
     for rise, (depth, lateral), relative in zip(found, values.tolist(), (errors / values).square().sum(dim=1).tolist()):
         assert rise.ratio == pytest.approx(depth / lateral)
-        assert rise.ratio_error == pytest.approx(abs(rise.ratio) * sqrt(relative))
+        assert rise.ratio_error == pytest.approx(abs(depth / lateral) * sqrt(relative))
     assert depth_rises(objective, generator(), steps, draws) == found
 
 
