@@ -9,7 +9,7 @@ returns a frozen result that carries its error.  Bad arguments, and products tha
                   `gauss_newton_traces`, ... by its backward passes alone; `renderer_eigenpairs`; `Monitor` of a training
     checks        `check_operator`: is it symmetric, are its products finite?
     estimators    `estimate_traces`, `estimate_diagonal`, `extreme_eigenpairs`, `spectral_density`
-    indices       `anisotropy` of ends and a density; `block_anisotropies`: of the whole operator and of each of its blocks
+    indices       `anisotropy` of ends and a density; `block_anisotropy`: of an operator or a block of it
     slices        `evaluate_slice` along `random_directions`, `gradient_direction`, ...; at finite
                   steps `finite_probe` and `critical_sharpness`
     processes     `Ranks`, `DistributedOperator`

@@ -51,8 +51,6 @@ from .spectrum.anisotropy import participation_ratio as participation_ratio
 from .spectrum.anisotropy import top_mass as top_mass
 from .spectrum.block_anisotropy import BlockAnisotropy as BlockAnisotropy
 from .spectrum.block_anisotropy import BlockAnisotropySettings as BlockAnisotropySettings
-from .spectrum.block_anisotropy import WarmStart as WarmStart
-from .spectrum.block_anisotropy import block_anisotropies as block_anisotropies
 from .spectrum.block_anisotropy import block_anisotropy as block_anisotropy
 from .spectrum.density import ActiveSpace as ActiveSpace
 from .spectrum.density import spectral_density as spectral_density

@@ -60,7 +60,7 @@ def written_map(folder: Path, made: dict[str, Any]) -> None:
     """The files of a map that a page reads.  made: its provenance."""
     shade = {"name": "largest", "words": "largest <curvature>", "unit": "1", "scale": "log", "low": 0.0, "high": 1.0}
     swaps = {"lengths": [1.0], "share": [[0.5]], "pairs": [4], "jump": None, "jump_error": None, "sampled": 0}
-    axes = {"condition": {"50": 2.0}, "needles": 0.1, "needles_steepest": {}, "needles_trace": {}, "one_view": 0.2}
+    axes = {"needles": 0.1, "needles_steepest": {}, "needles_trace": {}, "one_view": 0.2}
     axes |= {"swaps": swaps, "one_view_trace": None, "opacity_one_view": None}
     found = {"gaussians": 5, "seen": 4, "field": "largest", "shades": {"largest": shade}, "fragility": axes}
     found |= {"panels": [{"name": "a.png", "place": 0, "file": "view-000", "psnr": 20.0}], "provenance": made}
@@ -123,7 +123,7 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
         "round_off": {"value": 0.0, "bound": 1e-6, "passed": True},
         "finite_difference": skipped,
     }
-    loss = {"loss": "0.8 L1 + 0.2 (1 - SSIM)", "operator": "hessian", "value": 0.0832, "gradient_norm": 0.41}
+    loss = {"loss": "0.8 L1 + 0.2 (1 - SSIM)", "value": 0.0832, "gradient_norm": 0.41}
     data = {"objective": loss, "traces": traces, "eigenvalues": ends, "anisotropy": indices, "slice": _plane(scale)}
     data |= {"counts": counts, "checks": checks, "notes": ["SH bands 1 to 3 are not in use and were left out"]}
     data["timing"] = {"load": 0.4, "linearise": 0.9, "traces": 8.2, "eigenvalues": 21.5, "slice": 14.0, "total": 45.0}
@@ -184,11 +184,11 @@ def synthetic_line(scale: float = 1.0) -> tuple[dict[str, Any], dict[str, dict[s
     evaluated = np.arange(21) % 2 == 0
     steps = np.array([1e-6, 1e-5, 1e-4, 1e-3])
     direction = {"name": "gradient", "kind": "gradient", "slope": 2e-3 * scale, "curvature": curvature}
-    direction |= {"residual": None, "unit": 2e-3, "length": 1.0, "scale": "units of the parameters"}
+    direction |= {"residual": None, "unit": 2e-3, "scale": "units of the parameters"}
     line = {"directions": [direction], "loss_scale": 8e-5 * scale, "center_loss": center, "points": 21}
     line |= {"evaluated_points": 11, "crossed_points": 6, "evaluations": 12, "interpolation_error": 0.004}
-    probe = {"steps": steps.tolist(), "curvatures": [c * scale for c in (-3e4, 41.0, 55.0, 70.0)], "best": 1}
-    probe |= {"round_off": [error * scale for error in (4e4, 4.0, 0.04, 4e-4)], "truncation": [1.0] * 4}
+    probe = {"steps": steps.tolist(), "curvatures": [c * scale for c in (-3e4, 41.0, 55.0, 70.0)]}
+    probe |= {"round_off": [error * scale for error in (4e4, 4.0, 0.04, 4e-4)]}
     probe |= {"crossed": [False, False, True, True], "infinitesimal": curvature}
     data = {"objective": whole["objective"], "slice": line | {"holdout_points": 3}, "finite_probe": probe}
     data |= {name: whole[name] for name in ("counts", "timing", "notes", "provenance")}

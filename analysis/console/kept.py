@@ -33,7 +33,7 @@ class Entry(msgspec.Struct):
 
     value: msgspec.Raw
     notes: list[str]
-    counts: list[int]
+    count: int
     seconds: float
 
 
@@ -41,10 +41,9 @@ class Kept:
     """Runs stages, or reads what they found before.
 
     streams: names of all stages; each draws from a stream of its own, so that its numbers do not depend on which others have
-    run.  count: of products and such, so far.  folder: None to keep nothing.  identity: all that the numbers depend on, as
-    text.
+    run.  done: of products, so far.  folder: None to keep nothing.  identity: all that the numbers depend on, as text.
 
-    notes, counts: of all stages.
+    notes, count: of all stages.
     """
 
     def __init__(
@@ -52,15 +51,15 @@ class Kept:
         stages: Stages,
         generator: torch.Generator,
         streams: Sequence[str],
-        count: Callable[[], list[int]] = lambda: [],
+        done: Callable[[], int] = lambda: 0,
         folder: Path | None = None,
         identity: str = "",
     ) -> None:
-        self.stages, self.folder, self.count = stages, folder, count
+        self.stages, self.folder, self.done = stages, folder, done
         self.identity = identity.encode("utf-8", "surrogateescape")
         self.streams = {name: spawn(generator) for name in streams}
         self.notes: list[str] = []
-        self.counts: list[int] = []
+        self.count = 0
 
     def run(self, name: str, kind: type[T], work: Task[T]) -> T:
         """What the stage finds, or found before."""
@@ -74,17 +73,16 @@ class Kept:
                 write_atomically(_file(self.folder, name), self._digest(content) + content)
         value, entry = found
         self.notes += entry.notes
-        self.counts = [sum(both) for both in zip(self.counts or [0] * len(entry.counts), entry.counts, strict=True)]
+        self.count += entry.count
         return value
 
     def _done(self, name: str, work: Task[T]) -> tuple[T, Entry]:
         """What the work finds, as it is and as it is kept."""
-        notes, before = [], self.count()
+        notes, before = [], self.done()
         with self.stages.stage(name) as report:
             value = work(self.streams[name], report, notes)
-        counts = [after - first for after, first in zip(self.count(), before, strict=True)]
         content = msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_plain))
-        return value, Entry(content, notes, counts, self.stages.timing[name])
+        return value, Entry(content, notes, self.done() - before, self.stages.timing[name])
 
     def _read(self, name: str, kind: type[T]) -> tuple[T, Entry] | None:
         """What a stage found; None where nothing that can be read and is this command's is kept."""

@@ -77,37 +77,6 @@ class DepthSplit:
         return Bracket(LATERAL_DIRECTIONS * depth.value / lateral.value, min(ends), max(ends))
 
 
-@dataclass(frozen=True, eq=False)
-class DepthRises:
-    """Rises of the loss: a row for each length of steps, a column for each of KINDS.
-
-    steps: px.  errors: standard errors of the means over draws.  discontinuous: share of the renders in which the order of the
-    splats, or the set of visible ones, differs from that at the start.
-    """
-
-    steps: tuple[float, ...]
-    values: Float64[Tensor, "s 2"]
-    errors: Float64[Tensor, "s 2"]
-    discontinuous: Float64[Tensor, "s 2"]
-
-    @property
-    def ratios(self) -> tuple[Float64[Tensor, " s"], Float64[Tensor, " s"]]:
-        """Depth over lateral, with standard errors."""
-        (depth, lateral), relative = self.values.unbind(dim=1), self.errors / self.values
-        return depth / lateral, (depth / lateral).abs() * relative.square().sum(dim=1).sqrt()
-
-    def rows(self) -> list[Rise]:
-        """Rows of the record, with None for numbers that are not finite."""
-        columns: dict[str, Sequence[float]] = dict(zip(("ratio", "ratio_error"), (x.tolist() for x in self.ratios)))
-        for kind, name in enumerate(KINDS):
-            for suffix, table in (("", self.values), ("_error", self.errors), ("_crossed", self.discontinuous)):
-                columns[f"{name}{suffix}"] = table[:, kind].tolist()
-        numbers = [
-            {name: finite_or_none(column[i]) for name, column in columns.items()} for i in range(len(self.steps))
-        ]
-        return [convert({"pixels": step, **row}, Rise) for step, row in zip(self.steps, numbers, strict=True)]
-
-
 def _ratio(components: Float64[Tensor, "pairs 2"]) -> float:
     depth, lateral = components.square().sum(dim=0).tolist()
     return (LATERAL_DIRECTIONS * depth / lateral) ** 0.5 if lateral > 0 else nan
@@ -133,7 +102,7 @@ def measure_depth(
 ) -> Depth:
     """The stage `depth` of a probe.  steps: px."""
     found = depth_split(objective, generator, traces, report)
-    rises = depth_rises(objective, generator, steps, progress=report).rows()
+    rises = depth_rises(objective, generator, steps, progress=report)
     return convert(
         {
             "gradient_ratio": finite_or_none(found.gradient_ratio),
@@ -181,8 +150,11 @@ def depth_rises(
     steps: Sequence[float] = STEPS,
     draws: int = DRAWS,
     progress: Progress | None = None,
-) -> DepthRises:
-    """Rises of the loss by steps along and across the rays.  steps: px; draws: of the directions and signs, 2 or more."""
+) -> list[Rise]:
+    """Rises of the loss by steps along and across the rays, with None for numbers that are not finite.
+
+    steps: px; draws: of the directions and signs, 2 or more.
+    """
     if draws < 2:
         raise InputError(f"expected at least 2 draws, got {draws}")
     seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
@@ -201,7 +173,14 @@ def depth_rises(
                     index * draws + draw + 1, len(objective.views) * draws, "finite steps along and across the rays"
                 )
     rises, discontinuous = rises / len(objective.views), discontinuous / len(objective.views)
-    return DepthRises(tuple(steps), rises.mean(dim=2), rises.std(dim=2) / draws**0.5, discontinuous.mean(dim=2))
+    values, errors = rises.mean(dim=2), rises.std(dim=2) / draws**0.5
+    ratio, relative = values[:, 0] / values[:, 1], errors / values
+    columns = {"ratio": ratio, "ratio_error": ratio.abs() * relative.square().sum(dim=1).sqrt()}
+    for suffix, table in (("", values), ("_error", errors), ("_crossed", discontinuous.mean(dim=2))):
+        columns |= {f"{name}{suffix}": table[:, kind] for kind, name in enumerate(KINDS)}
+    numbers = torch.stack(list(columns.values()), dim=1).tolist()
+    rows = [dict(zip(columns, map(finite_or_none, row), strict=True)) for row in numbers]
+    return [convert({"pixels": step, **row}, Rise) for step, row in zip(steps, rows, strict=True)]
 
 
 def rays_of(objective: SceneObjective, index: int) -> Float[Tensor, "n 3"]:

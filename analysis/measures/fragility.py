@@ -31,7 +31,6 @@ MARGIN = 1e-3  # of the way, before and behind the place of a swap; at least so 
 ROUND_OFFS = 8
 ALONE = 0.9
 STEEPEST = 0.01  # of the Gaussians in sight
-PERCENTILES = (50, 90, 99, 100)
 ATTRIBUTES = ("quats", "log_scales")
 
 
@@ -46,7 +45,6 @@ def fragility(
     alone = values["one_view"] >= ALONE
     return Fragility(
         swaps=swaps(objective, sights, generator, progress),
-        condition={f"{p}": float(np.percentile(condition.numpy(), p)) for p in PERCENTILES},
         needles=share_of(torch.ones_like(condition), needles),
         needles_steepest={
             name: share_of(torch.ones(count), needles[found.topk(count).indices]) for name, found in curvatures.items()

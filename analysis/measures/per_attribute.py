@@ -27,12 +27,19 @@ from analysis.measures.units import Metric, optimiser_units, scene_size, scene_u
 from analysis.records import schema
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord
-from landscape import BlockAnisotropy, BlockAnisotropySettings, Bracket, ScaledOperator, block_anisotropies
+from landscape import (
+    BlockAnisotropy,
+    BlockAnisotropySettings,
+    Bracket,
+    RestrictedOperator,
+    ScaledOperator,
+    block_anisotropy,
+)
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.probes import spawn
 from landscape.results import Progress, finite_or_none
-from landscape.spectrum.block_anisotropy import WHOLE, WarmStart
+from landscape.spectrum.block_anisotropy import WHOLE
 from landscape.traces.trace import total_trace
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
@@ -66,13 +73,12 @@ class PerAttributeOptions:
 
 @dataclass(frozen=True, eq=False)
 class FamilyRow:
-    """One family.  dim: rows of the block, its null space included (see `BlockAnisotropy.rank`)."""
+    """One family."""
 
     scene: SceneName
     operator: schema.Operator
     block: str
     gaussians: int
-    dim: int
     family: BlockAnisotropy
 
     def record(self, metric: Metric, unit: str) -> schema.BlockAnisotropy:
@@ -84,15 +90,11 @@ class FamilyRow:
             block=self.block,
             split=self.scene == "split",
             gaussians=self.gaussians,
-            dim=self.dim,
             rank=found.rank,
             lambda_max=convert(ends.largest.record(), schema.End),
             lambda_min=convert(ends.smallest.record(), schema.End),
             beyond=finite_or_none(ends.beyond),
             indices=convert(found.indices.record(), schema.Anisotropy),
-            starts=len(found.density.nodes),
-            steps=found.density.nodes.shape[1],
-            matvecs=ends.matvecs + found.density.matvecs,
         )
 
 
@@ -113,11 +115,7 @@ class FamilyFindings:
         if split := self.control:
             psnr = split.psnr if split.rms else None
             control = schema.SplitControl(
-                gaussians=len(split.gaussians),
-                rms=split.rms,
-                largest=split.largest,
-                psnr=psnr,
-                effects=list(self.effects),
+                gaussians=len(split.gaussians), rms=split.rms, psnr=psnr, effects=list(self.effects)
             )
         return structs.replace(
             record, per_attribute=families, split_control=control, notes=[*record.notes, *self.notes]
@@ -160,7 +158,7 @@ def measure_per_attribute(
             known = ends if scene == "trained" and operator == "hessian" and D is None else None
             measured = _of_operator(hessian, D, known, options, stream, report, notes)
             count = len(scenes[scene].active)
-            rows += [FamilyRow(scene, operator, block, count, dim, found) for block, dim, found in measured]
+            rows += [FamilyRow(scene, operator, block, count, found) for block, found in measured]
     return FamilyFindings(tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)), options.metric, unit)
 
 
@@ -195,8 +193,8 @@ def _of_operator(
     generator: torch.Generator,
     report: Progress,
     notes: list[str],
-) -> list[tuple[str, int, BlockAnisotropy]]:
-    """(block, dim, family) of the whole and of every attribute of one operator.
+) -> list[tuple[str, BlockAnisotropy]]:
+    """(block, family) of the whole and of every attribute of one operator.
 
     ends: of the whole, where known.  notes: gets sentences on what was left out.
     """
@@ -210,14 +208,13 @@ def _of_operator(
             continue
         report(done, len(names), name)
 
-        def say(_: int, __: int, state: str, done: int = done) -> None:
-            report(done, len(names), state)
+        def say(_: int, __: int, state: str, done: int = done, name: str = name) -> None:
+            report(done, len(names), f"{name}: {state}")
 
-        dim = hessian.dim if name == WHOLE else hessian.blocks[name].stop - hessian.blocks[name].start
-        lead = WarmStart(_start(hessian, name, scale, ends), traces.get(name))
-        found.append(
-            (name, dim, block_anisotropies(operator, stream, settings, [name], spaces, say, {name: lead})[name])
-        )
+        part = operator if name == WHOLE else RestrictedOperator(operator, name)
+        start = _start(hessian, name, scale, ends)
+        family = block_anisotropy(part, spawn(stream), settings, spaces.get(name), say, start, traces.get(name))
+        found.append((name, family))
     report(len(names), len(names), "done")
     return found
 

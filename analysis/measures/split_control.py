@@ -35,11 +35,10 @@ KNOTS = np.linspace(0, 1, 65)  # opacities at which x / o and k are found; linea
 
 @dataclass(frozen=True, eq=False)
 class SplitControl:
-    """gaussians: first halves in the order of the given ones, then second halves; rms and largest change of the images."""
+    """gaussians: first halves in the order of the given ones, then second halves; rms: change of the images."""
 
     gaussians: Gaussians
     rms: float
-    largest: float
 
     @property
     def psnr(self) -> float:
@@ -97,13 +96,12 @@ def split_control(
     if not cameras:
         raise ValueError("expected at least one camera to compare images in, got none")
     background = torch.zeros(3) if background is None else background
-    result, squares, largest, values = split_in_two(gaussians), 0.0, 0.0, 0
+    result, squares, values = split_in_two(gaussians), 0.0, 0
     for camera in cameras:
         before, after = (_image(some, camera, background, settings) for some in (gaussians, result))
         change = after - before
         squares, values = squares + float(change.square().sum()), values + change.numel()
-        largest = max(largest, float(change.abs().max()))
-    return SplitControl(result, (squares / values) ** 0.5, largest)
+    return SplitControl(result, (squares / values) ** 0.5)
 
 
 def _image(gaussians: Gaussians, camera: Camera, background: Tensor, settings: RenderSettings) -> Tensor:

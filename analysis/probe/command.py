@@ -26,7 +26,7 @@ from analysis.measures.memory import expected_peak, size_of
 from analysis.measures.units import optimiser_units, step_lengths
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
-from analysis.probe.plan import MEASURES, compiles, expected_seconds, seconds_of_render
+from analysis.probe.plan import MEASURES, expected_seconds, seconds_of_render
 from analysis.probe.record import probe_arrays, probe_record
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.views import write_views
@@ -184,8 +184,7 @@ def _expected(objective: SceneObjective, settings: ProbeSettings, further: float
     peak = expected_peak(objective)
     objective.loss(objective.active.flat)  # untimed, as the kernels may compile
     seconds = expected_seconds(settings, seconds_of_render(objective), further)
-    more = ", plus compiling, once" if compiles(objective.active.flat.device) else ""
-    return f"about {seconds:,.0f} s, roughly{more}, and {peak / 1e9:.1f} GB of memory"
+    return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
 
 
 def conclude(data: ProbeRecord, out: Path, guessed: Sequence[str]) -> None:

@@ -107,8 +107,8 @@ def measure(
     with stages.stage("checks") as report:
         operator_check = check_operator(at.operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(at.hessian, spawn(generator), report, settings.checked_views)
-    of_checks = at.work()
-    kept = Kept(stages, generator, STREAMS, at.work, folder, identity)
+    of_checks = at.operator.matvecs
+    kept = Kept(stages, generator, STREAMS, lambda: at.operator.matvecs, folder, identity)
     return _all_stages(at, steps, kept, operator_check, gradient_check, of_checks, population)
 
 
@@ -125,10 +125,6 @@ class _Point:
     settings: ProbeSettings
     gradient: Tensor
     value: float
-
-    def work(self) -> list[int]:
-        """Products H v so far."""
-        return [self.operator.matvecs]
 
 
 def _linearised(objective: SceneObjective, settings: ProbeSettings, ranks: Ranks, report: Progress) -> _Point:
@@ -148,10 +144,10 @@ def _all_stages(
     kept: Kept,
     operator_check: OperatorCheck,
     gradient_check: ProductCheck,
-    of_checks: list[int],
+    of_checks: int,
     population: int | None,
 ) -> Measured:
-    """The stages after the checks.  of_checks: `_Point.work` that these took."""
+    """The stages after the checks.  of_checks: products H v that these took."""
     settings = at.settings
     traces = kept.run("traces", dict[str, TraceEstimate], partial(_traces, at))
     search = kept.run("eigenvalues", Search, partial(_ends, at))
@@ -177,7 +173,7 @@ def _all_stages(
         depth=depth,
         plane=plane,
         rendered=rendered,
-        matvecs=of_checks[0] + kept.counts[0],
+        matvecs=of_checks + kept.count,
         rank=at.hessian.rank,
         notes=(*(LEFT_OUT[name] for name, each in wanted.items() if not each), *kept.notes),
         left_out=None if population is None else _left_out(at, ends, population),

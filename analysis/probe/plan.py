@@ -1,11 +1,7 @@
 """Expected duration of a probe, from the time that a render of all views takes here."""
 
-from pathlib import Path
 from statistics import median
 from time import monotonic
-
-import torch
-from numba.core import config
 
 from analysis.probe.settings import ProbeSettings
 from splat.curvature.objective import SceneObjective
@@ -16,15 +12,6 @@ MEASURES = 33.0  # products with MOST_AT_ONCE vectors that --measures takes as l
 PRODUCT, BEFORE = 4.5, 50  # in renders: a product with MOST_AT_ONCE vectors; all that comes before the first stage
 PICTURES, QUICK_PICTURES = 3.0, 0.5  # seconds to draw them, which hardly depend on the scene
 POINTS = 320  # of a slice's plane that are usually rendered
-PRODUCTS = (
-    "*/tangents.backward_tangent-*.nbi"  # the kernel of products, which a training does not compile, as it is kept
-)
-
-
-def compiles(device: torch.device) -> bool:
-    """Whether products are still to be compiled: no earlier run has kept the CPU's kernels of them."""
-    kept = Path(config.CACHE_DIR).glob(PRODUCTS)  # pyright: ignore[reportAttributeAccessIssue]
-    return device.type == "cpu" and not any(kept)
 
 
 def seconds_of_render(objective: SceneObjective) -> float:

@@ -13,7 +13,6 @@ from analysis.probe.measured import LeftOut, Measured, PlaneSlice
 from analysis.probe.settings import TEN
 from analysis.records import schema
 from analysis.records.provenance import Provenance
-from analysis.records.quantities import quantity
 from analysis.records.records import Check, Counts, ProbeRecord, counts_of, objective_of
 from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, eigenvalue_ratio
@@ -185,9 +184,6 @@ def paper_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
 
 
 def slice_record(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
-    reaches = [float(axis.abs().max()) for axis in plane.slice.coordinates]
-    units = [reach / unit for reach, unit in zip(reaches, plane.units, strict=True)]
-    x, y = map(quantity, reaches)
     numbers = zip(NAMES, pairs.values.tolist(), pairs.residuals.tolist(), plane.units, strict=False)
     return schema.Slice(
         directions=[
@@ -196,7 +192,6 @@ def slice_record(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
         ],
         loss_scale=plane.loss_scale,
         **plane.slice.record(),  # pyright: ignore[reportArgumentType]
-        note=f"±{quantity(units[0])} curvature units each way: ±{x} along e₁ and ±{y} along e₂, units of the parameters",
     )
 
 

@@ -76,7 +76,7 @@ def of_checks(checks: Mapping[str, Check]) -> list[Line]:
 
 def _of_traces(traces: Mapping[str, schema.Trace]) -> list[Line]:
     lines = [
-        Line(f"The trace of {attribute_name(name)} is {quantity(trace.value)}{_in_brackets(trace.note)}.", "failure")
+        Line(f"The trace of {attribute_name(name)} is {quantity(trace.value)}.", "failure")
         for name, trace in traces.items()
         if not _is_finite(trace.value)
     ]

@@ -347,7 +347,6 @@ def objective_of(
         loss=loss_name(objective.loss_settings),
         sizes=[(view.camera.width, view.camera.height) for view in objective.views],
         background=tuple(objective.background.tolist()),
-        operator="hessian",
         value=value,
         gradient_norm=gradient_norm,
         views_error=views_error,

@@ -19,7 +19,7 @@ from msgspec import Meta, Struct
 
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.json_files import read_json, with_remedy
-from analysis.records.provenance import Machine, Provenance
+from analysis.records.provenance import Provenance
 from analysis.records.quantities import Shade
 from analysis.records.schema import INDICES, Count, NonNegative, Number, Portion
 from landscape.errors import InputError
@@ -77,15 +77,6 @@ class Seconds(Struct):
     peak: int | None = None
 
 
-class Made(Struct, kw_only=True):
-    """Time, machine, code, and what the numbers are about, as in `Provenance`."""
-
-    created: str = ""
-    machine: Machine | None = None
-    commit: str | None = None
-    fingerprint: Fingerprint | None = None
-
-
 class Scores(Struct, kw_only=True):
     """Scores of a training; test: None without held-out views."""
 
@@ -93,7 +84,7 @@ class Scores(Struct, kw_only=True):
     train: ViewScores | None = None
     test: ViewScores | None = None
     seconds: Seconds | None = None
-    provenance: Made | None = None
+    provenance: Provenance | None = None
 
 
 class Comparison(Struct, kw_only=True):
@@ -174,15 +165,14 @@ class Swaps(Struct, kw_only=True):
 class Fragility(Struct, kw_only=True):
     """The three axes (`analysis.measures.fragility`).  Shares are of the Gaussians in sight, or of a trace where it says so.
 
-    condition: percentile -> condition number.  needles: share that are; needles_steepest: share of the steepest hundredth in an
-    attribute that are; needles_trace: share of an attribute's curvature that they hold.  one_view: share that one view alone
-    sees, one_view_trace: share of opacity's curvature on these, opacity_one_view: rank correlation of a Gaussian's curvature in
-    opacity with the share of its weight that one view alone sees; None where all have the same.  depth_gradient: of the
-    positions' gradient along the rays over one direction across them (`analysis.measures.depth`).
+    needles: share that are; needles_steepest: share of the steepest hundredth in an attribute that are; needles_trace: share of
+    an attribute's curvature that they hold.  one_view: share that one view alone sees, one_view_trace: share of opacity's
+    curvature on these, opacity_one_view: rank correlation of a Gaussian's curvature in opacity with the share of its weight
+    that one view alone sees; None where all have the same.  depth_gradient: of the positions' gradient along the rays over one
+    direction across them (`analysis.measures.depth`).
     """
 
     swaps: Swaps
-    condition: dict[str, float]
     needles: float
     needles_steepest: dict[str, float]
     needles_trace: dict[str, float]

@@ -46,7 +46,6 @@ class Objective(Struct, kw_only=True):
     loss: str | None = None
     sizes: list[tuple[int, int]] | None = None
     background: tuple[float, float, float] | None = None
-    operator: Operator | None = None
     value: Number = None
     gradient_norm: Number = None
     views_error: Maybe[Number] = UNSET
@@ -58,7 +57,7 @@ class TraceOf(Struct, kw_only=True):
     standard_error: of value; 0 where the method is exact.  low, high: ends of the interval at `confidence`, e.g. 0.95.
     sign: "undetermined" where the interval does not decide it.  dim: parameters of the block.  probes: random vectors; 0 where
     exact.  matvecs: products H v.  reason: why it stopped, one of `landscape.results.StopReason`.
-    method: "exact", or "exact, but SSIM's window is sampled".  note: why value is null, ...
+    method: "exact", or "exact, but SSIM's window is sampled".
     views_error: where training views were left out (`Counts.views_of`), the standard error of value as an estimate for all
     views, as if those measured had been drawn at random; null where not known.
     """
@@ -74,7 +73,6 @@ class TraceOf(Struct, kw_only=True):
     matvecs: Count = 0
     reason: str = ""
     method: str
-    note: Maybe[str] = UNSET
     views_error: Maybe[Number] = UNSET
 
     @property
@@ -115,16 +113,14 @@ class LivesOn(Struct, kw_only=True):
 class End(Struct, kw_only=True):
     """A Ritz value of an operator, signed, with its unit Ritz vector v.
 
-    residual: |H v - value v|: an eigenvalue lies within this distance.  vector_error: about the sine of the angle between v and
-    the true eigenvector.  reason, note: as for `TraceOf`.  views_error: likewise, of v . H v at this v; in the views left out
-    another direction may be steeper; the largest eigenvalue of few views is usually too large, as it is convex in H.
+    residual: |H v - value v|: an eigenvalue lies within this distance.  reason: as for `TraceOf`.  views_error: likewise, of
+    v . H v at this v; in the views left out another direction may be steeper; the largest eigenvalue of few views is usually
+    too large, as it is convex in H.
     """
 
     value: Number
     residual: Number
-    vector_error: Number = None
     reason: str | None = None
-    note: Maybe[str] = UNSET
     views_error: Maybe[Number] = UNSET
 
     @property
@@ -251,29 +247,24 @@ class Concentration(Named[Index], kw_only=True):
 class FiniteProbe(Struct, kw_only=True):
     """The second difference (L(+d v) + L(-d v) - 2 L) / d^2 along a direction v, for all steps d of it.
 
-    round_off, truncation: bounds of its errors.  crossed: whether the order of the splats or the set of visible ones changed,
-    by step; None where not known.  infinitesimal: v . H v.  center_loss, noise: L and the standard deviation of the error of an
-    evaluation.  best: index of the step with the least error among those without a crossing; None without any.
+    round_off: bound of its error.  crossed: whether the order of the splats or the set of visible ones changed, by step; None
+    where not known.  infinitesimal: v . H v.  center_loss, noise: L and the standard deviation of the error of an evaluation.
     evaluations: renders of all views.
     """
 
     steps: Annotated[list[float], Meta(min_length=1)]
     curvatures: list[Number]
     round_off: list[Number]
-    truncation: list[Number]
     crossed: list[bool] | None
     infinitesimal: Number
     center_loss: Number = None
     noise: Number = None
-    best: Count | None
     evaluations: Count = 0
 
     def __post_init__(self) -> None:
-        columns = [self.curvatures, self.round_off, self.truncation, *([self.crossed] if self.crossed else [])]
+        columns = [self.curvatures, self.round_off, *([self.crossed] if self.crossed else [])]
         if {len(column) for column in columns} != {len(self.steps)}:
-            raise ValueError("Expected one curvature, round_off, truncation and crossed for each step, got others")
-        if self.best is not None and self.best >= len(self.steps):
-            raise ValueError(f"Expected `best` below {len(self.steps)}, the number of steps, got {self.best}")
+            raise ValueError("Expected one curvature, round_off and crossed for each step, got others")
 
 
 class Rise(Struct, kw_only=True):
@@ -314,8 +305,8 @@ class BlockAnisotropy(Struct, kw_only=True):
     """The anisotropy of one diagonal block of one operator (`analysis.measures.per_attribute`).
 
     metric, unit: units in which curvature is compared, by name and in words.  block: "all" or an attribute.  split: whether of
-    the split scene.  dim: rows of the block; rank: dim less the exact null space.  beyond: distance beyond the Ritz values
-    that the spectrum may reach (`landscape.eigen.pairs.EigenEnds`).  starts, steps: of the density.
+    the split scene.  rank: rows of the block less the exact null space.  beyond: distance beyond the Ritz values that the
+    spectrum may reach (`landscape.eigen.pairs.EigenEnds`).
     """
 
     metric: str
@@ -324,15 +315,11 @@ class BlockAnisotropy(Struct, kw_only=True):
     block: str
     split: bool
     gaussians: Count
-    dim: Count
     rank: Count
     lambda_max: End
     lambda_min: End
     beyond: Number = None
     indices: Anisotropy
-    starts: Count = 0
-    steps: Count = 0
-    matvecs: Count = 0
 
 
 class Effect(Index, kw_only=True):
@@ -346,12 +333,11 @@ class Effect(Index, kw_only=True):
 class SplitControl(Struct, kw_only=True):
     """Effect of splitting every Gaussian in two (`analysis.measures.split_control`).
 
-    gaussians: of the split scene.  rms, largest, psnr (dB): change of the images; psnr is None where nothing changed.
+    gaussians: of the split scene.  rms, psnr (dB): change of the images; psnr is None where nothing changed.
     """
 
     gaussians: Count
     rms: float
-    largest: float
     psnr: Number
     effects: list[Effect]
 
@@ -361,8 +347,7 @@ class Direction(Struct, kw_only=True):
 
     kind: "eigenvectors", "random", "gradient" or "line".  slope, curvature: of the loss along it.  residual: of an
     eigenvector, else None.  unit: sqrt(2 loss_scale / |curvature|), the step within which the curvature alone changes the loss
-    by loss_scale; infinite without curvature.  length: of the vector, in units of the parameters.  scale: what a step of 1 is.
-    views_error: of the curvature, as for `TraceOf`.
+    by loss_scale; infinite without curvature.  scale: what a step of 1 is.  views_error: of the curvature, as for `TraceOf`.
     """
 
     name: str
@@ -371,7 +356,6 @@ class Direction(Struct, kw_only=True):
     curvature: Number
     residual: Number = None
     unit: Number
-    length: Maybe[Number] = UNSET
     scale: Maybe[str] = UNSET
     views_error: Maybe[Number] = UNSET
 
@@ -399,7 +383,6 @@ class Slice(Struct, kw_only=True):
     error_seen: Maybe[Number] = UNSET
     holdout_points: Count = 0
     reason: str = ""
-    note: Maybe[str] = UNSET
 
     def __post_init__(self) -> None:
         if self.resolved is False and self.evaluated_points is None:

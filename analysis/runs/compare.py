@@ -31,7 +31,7 @@ from analysis.records.run_files import COMPARISON, Comparison
 from analysis.runs.compare_table import Row, Run, compare_table, comparison, frame
 from analysis.runs.compared import checkpoint_path, compared, probe, probe_command, probe_folder, probed, scores_of
 from analysis.runs.options import CompareOptions
-from analysis.runs.seeds import SPREAD, Group, grouped, groups_of, headings, identical, sayings
+from analysis.runs.seeds import SPREAD, Group, grouped, groups_of, headings, sayings
 from landscape.errors import InputError
 from splat.training.checkpoint import write_atomically
 from splat.training.origin.fingerprint import changes, in_short
@@ -87,7 +87,7 @@ def run_compare(options: CompareOptions) -> int:
     losses = {run.label: run.data.objective.loss for run in runs}
     require_alike("loss", losses, "probe all of them with --loss 3dgs")
     named = [replace(group, label=os.path.relpath(Path(group.label).resolve(), common)) for group in groups]
-    _write(runs, named, identical(labels, checkpoints), notes, options.out or common / "compare")
+    _write(runs, named, notes, options.out or common / "compare")
     return 0
 
 
@@ -208,7 +208,7 @@ def _once(lines: Sequence[tuple[Run, str]]) -> list[str]:
     ]
 
 
-def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], found: Sequence[str], out: Path) -> None:
+def _write(runs: Sequence[Run], groups: Sequence[Group], found: Sequence[str], out: Path) -> None:
     """Table, pictures, page; and what it says, the cautions and the table once more for the terminal.
 
     found: the cautions so far.
@@ -216,7 +216,7 @@ def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], fo
     console, labels = Console(), [run.label for run in runs]
     rows, notes = comparison(runs), [*found, *cautions(runs, any(len(group.folders) > 1 for group in groups))]
     shown = grouped(rows, groups)
-    says = [*same, *sayings(shown, groups)]
+    says = sayings(shown, groups)
     shown_runs = {folder: group.label for group in groups for folder in group.folders[:1]}
     if len(shown_runs) < len(runs):
         notes.append(f"The pictures show the first run of each group: {', '.join(map(str, shown_runs))}.")

@@ -161,8 +161,7 @@ def _plain(value: float | str | None, places: int | None = None) -> Entry:
 def _trace(trace: Trace | None) -> Entry:
     if trace is None:
         return MISSING
-    cell = Cell(measured(trace.value, trace.standard_error), "", trace.note or "")
-    return Entry(trace.value, cell, trace.low, trace.high)
+    return Entry(trace.value, Cell(measured(trace.value, trace.standard_error)), trace.low, trace.high)
 
 
 def _end(end: Eigenvalue) -> Entry:

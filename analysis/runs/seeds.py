@@ -7,7 +7,6 @@ apart       two groups of two runs or more are in a quantity where their means d
             (Mickey and Brown, Annals of Mathematical Statistics 37, 1966)
 """
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, isfinite, sqrt
@@ -20,7 +19,6 @@ from analysis.records.quantities import PLUS_MINUS, measured, quantity
 from analysis.records.run_files import CHECKPOINT
 from analysis.records.tables import Cell
 from analysis.runs.compare_table import CONFIRMED, Entry, Row
-from splat.training.origin.subject import Checkpoint
 
 TOLD = ("held-out views", "trace", "spectrum", "anisotropy")  # sections whose differences are told
 MORE = {"top mass": 1, "participation ratio": -1}  # the sign of an index where curvature is less even
@@ -57,20 +55,6 @@ def headings(groups: Sequence[Group]) -> list[str]:
     """
     several = any(len(group.folders) > 1 for group in groups)
     return [f"{group.label} (n = {len(group.folders)})" if several else group.label for group in groups]
-
-
-def identical(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> list[str]:
-    """Lines on runs with the parameters of an earlier one, to the bit."""
-    first: dict[bytes, int] = {}
-    lines = []
-    for i, checkpoint in enumerate(checkpoints):
-        flat = checkpoint.training.gaussians.flat.detach().cpu()
-        j = first.setdefault(hashlib.sha256(flat.contiguous().numpy().tobytes()).digest(), i)
-        if j < i:
-            methods = {each.training.config.method.name for each in (checkpoint, checkpoints[j])}
-            why = "the method never acted: " if len(methods) > 1 else ""
-            lines.append(f"{labels[i]}: {why}parameters are identical to {labels[j]}.")
-    return lines
 
 
 def grouped(rows: Sequence[Row], groups: Sequence[Group]) -> list[Row]:

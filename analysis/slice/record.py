@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from math import inf, sqrt
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float64
 from msgspec import convert
 from torch import Tensor
@@ -49,8 +48,7 @@ def slice_record(found: Found, objective: SceneObjective, notes: list[str], made
     """All numbers that are no arrays, without timing."""
     grid, probe = found.slice, found.probe
     assert grid.slope is not None and grid.curvature is not None
-    lengths = torch.linalg.vector_norm(found.vectors.double(), dim=0)
-    numbers = [each.tolist() for each in (grid.slope, grid.curvature.diagonal(), lengths)]
+    numbers = (each.tolist() for each in (grid.slope, grid.curvature.diagonal()))
     directions = [
         schema.Direction(
             name=direction.name,
@@ -59,10 +57,9 @@ def slice_record(found: Found, objective: SceneObjective, notes: list[str], made
             curvature=curvature,
             residual=direction.residual,
             unit=sqrt(2 * found.loss_scale / abs(curvature)) if curvature else inf,
-            length=length,
             scale=direction.scale,
         )
-        for direction, slope, curvature, length in zip(found.directions, *numbers, strict=True)
+        for direction, slope, curvature in zip(found.directions, *numbers, strict=True)
     ]
     if found.population is not None and found.by_view is not None:
         for direction, curvatures in zip(directions, found.by_view.T, strict=True):

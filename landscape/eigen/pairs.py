@@ -43,10 +43,8 @@ class Eigenpairs:
         return {name: float(self.values[0]), f"{name}_error": float(self.residuals[0]), f"{name}_reason": self.reason}
 
     def record(self, index: int = 0) -> dict[str, Number | str]:
-        columns = {"value": self.values, "residual": self.residuals, "vector_error": self.vector_errors}
-        return {name: finite_or_none(float(column[index])) for name, column in columns.items()} | {
-            "reason": self.reason
-        }
+        value, residual = (finite_or_none(float(column[index])) for column in (self.values, self.residuals))
+        return {"value": value, "residual": residual, "reason": self.reason}
 
 
 @dataclass(frozen=True, eq=False)

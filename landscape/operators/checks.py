@@ -7,14 +7,12 @@ noise       |H (a z) / a - H z| / |H z| with a = 1/3: the change of a product wh
 
 from dataclasses import dataclass
 from math import isfinite, nan
-from typing import Any
 
 import torch
 
 from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
 from landscape.probes import draw_probes
-from landscape.results import plain
 
 SCALE = 1 / 3  # not a power of two, so that the scaled vector rounds differently
 ROUND_OFFS = 4e3  # units of round-off in a sum of 1.6e7 rounded terms, whose errors add up like a random walk
@@ -37,9 +35,6 @@ class OperatorCheck:
     @property
     def passed(self) -> bool:
         return self.finite and self.symmetry <= self.tolerance and self.noise <= self.tolerance
-
-    def record(self) -> dict[str, Any]:
-        return plain(self, "symmetry noise finite tolerance passed matvecs")
 
 
 def check_operator(

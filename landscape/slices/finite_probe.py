@@ -4,8 +4,6 @@
 
 round-off   4 sqrt(6 noise^2 + 2 (d s)^2) / d^2: four standard errors of a second difference of values with independent errors.
             s = eps |theta * H v| / sqrt(12): the rounding of theta + d v, times the slope d H v there
-truncation  estimate of |c(d) - v.H v|: the term in d^2 that makes neighbouring c(d) differ.  Without meaning across a kink or a
-            jump of L, where c(d) is not a derivative
 confirmed   a step where c(d) is beyond its round-off, has the sign of v.H v, and is between half and twice it.  A curvature is
             confirmed by three such steps, each twice the one before: the curvature 2 |d| / d^2 of a kink is halved from one to
             the next, so that it never is
@@ -44,7 +42,7 @@ STEPS = tuple(10.0 ** (k / 2) for k in range(-10, 1))
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FiniteProbe(ShortRepr):
-    """The curvature c(d) at increasing steps d, in multiples of the direction, with its round-off and truncation.
+    """The curvature c(d) at increasing steps d, in multiples of the direction, with its round-off.
 
     discontinuous: steps d for which +d or -d lies on another smooth piece than the centre; None where the objective does not
     name its pieces.  infinitesimal: v.H v, the limit of c(d) for small d.  noise: standard deviation of the error of one
@@ -54,20 +52,11 @@ class FiniteProbe(ShortRepr):
     steps: Float64[Tensor, " m"]
     curvatures: Float64[Tensor, " m"]
     round_off: Float64[Tensor, " m"]
-    truncation: Float64[Tensor, " m"]
     discontinuous: Bool[Tensor, " m"] | None
     infinitesimal: float
     center_loss: float
     noise: float
     evaluations: int
-
-    @property
-    def best(self) -> int | None:
-        """Index of the step with the smallest sum of round-off and truncation, among those that are not discontinuous."""
-        error = (self.round_off + self.truncation).nan_to_num(torch.inf, posinf=torch.inf)
-        if self.discontinuous is not None:
-            error = error.masked_fill(self.discontinuous, torch.inf)
-        return int(error.argmin()) if error.isfinite().any() else None
 
     def confirmation(self, least: float) -> tuple[bool | None, tuple[float, float] | None]:
         """Whether renders, say, confirm v.H v, and the shortest and longest of the steps that do; steps double.
@@ -90,7 +79,7 @@ class FiniteProbe(ShortRepr):
 
     def record(self) -> dict[str, Any]:
         crossed = None if self.discontinuous is None else self.discontinuous.tolist()
-        names = "steps curvatures round_off truncation infinitesimal center_loss noise best evaluations"
+        names = "steps curvatures round_off infinitesimal center_loss noise evaluations"
         return plain(self, names) | {"crossed": crossed}
 
 
@@ -111,8 +100,8 @@ def finite_probe(
     >>> from landscape.operators.operator import DenseOperator
     >>> found = finite_probe(lambda x: (x**4).sum(), torch.ones(1, dtype=torch.float64), torch.ones(1),
     ...                      DenseOperator(torch.full((1, 1), 12.0, dtype=torch.float64)), [0.1, 1.0])
-    >>> found.infinitesimal, found.curvatures, found.truncation
-    (12.0, tensor([12.0200, 14.0000], dtype=torch.float64), tensor([0.0200, 2.0000], dtype=torch.float64))
+    >>> found.infinitesimal, found.curvatures
+    (12.0, tensor([12.0200, 14.0000], dtype=torch.float64))
     """
     if len(steps) < 2 or not (steps[0] > 0 and all(a < b for a, b in pairwise(steps)) and isfinite(steps[-1])):
         raise ValueError(f"expected two or more positive steps that increase, got {tuple(steps)}")
@@ -140,7 +129,6 @@ def finite_probe(
         steps=d,
         curvatures=curvatures,
         round_off=4 * (6 * noise**2 + 2 * (d * slope).square()).sqrt() / d.square(),
-        truncation=_truncation(d, curvatures),
         discontinuous=None if here is None else other,
         infinitesimal=float(torch.dot(v, Hv)),
         center_loss=middle,
@@ -194,10 +182,3 @@ def evaluation_noise(values: Sequence[float]) -> float:
         raise ValueError(f"expected more than {ORDER} values, got {len(values)}")
     differences = np.diff(np.asarray(values, dtype=np.float64), ORDER)
     return sqrt(factorial(ORDER) ** 2 / factorial(2 * ORDER) * float(np.mean(differences**2)))
-
-
-def _truncation(steps: Tensor, curvatures: Tensor) -> Tensor:
-    """|a| d^2 of the parabola c(d) = c_0 + a d^2 through each step and the next larger one (for the last: the one before)."""
-    squares = steps.square()
-    slopes = (curvatures.diff() / squares.diff()).abs()
-    return torch.cat([slopes, slopes[-1:]]) * squares

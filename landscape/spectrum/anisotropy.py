@@ -39,13 +39,7 @@ class Anisotropy(ShortRepr):
     participation_ratio: Bracket | None = None
 
     def record(self) -> dict[str, object]:
-        members = {
-            "eigenvalue_ratio": self.eigenvalue_ratio,
-            "negative_ratio": self.negative_ratio,
-            "top_mass": self.top_mass,
-            "participation_ratio": self.participation_ratio,
-        }
-        return {name: bracket.record() for name, bracket in members.items() if bracket is not None}
+        return {name: bracket.record() for name, bracket in vars(self).items() if bracket is not None}
 
 
 CONFIDENCE = 0.95

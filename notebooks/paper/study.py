@@ -37,7 +37,7 @@ from msgspec import structs
 from analysis.console.overrides import overridden
 from analysis.records.provenance import require_own
 from analysis.records.records import ProbeRecord, read_record
-from analysis.records.run_files import CHECKPOINT, METRICS, Made, MapRecord, read_map, read_scores
+from analysis.records.run_files import CHECKPOINT, METRICS, MapRecord, read_map, read_scores
 from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
 from landscape.errors import InputError
 from notebooks.paper.effects import STRETCHED
@@ -98,11 +98,15 @@ def row_of(run: Path) -> dict[str, Any]:
         "views": len(checkpoint.scene.train),
         "size": ", ".join(sorted({f"{width} x {height}" for width, height in checkpoint.scene.sizes})),
     }
-    made = read_scores(run).provenance or Made()
+    made = read_scores(run).provenance
     require_own(
-        made.fingerprint, state, run / METRICS, "repeat the training's command with --resume, which scores again"
+        made and made.fingerprint,
+        state,
+        run / METRICS,
+        "repeat the training's command with --resume, which scores again",
     )
-    row |= metrics_of(run) | {"date": made.created[:10], "machine": made.machine.cpu if made.machine else ""}
+    assert made
+    row |= metrics_of(run) | {"date": made.created[:10], "machine": made.machine.cpu}
     row |= {"commit": made.commit or ""} | _of_map(run, state)
     if not (run / PROBE / ProbeRecord.FILE).is_file():
         return row

@@ -254,7 +254,7 @@ def _use_stages(root: Path, chance: Random) -> Read:
     from landscape import DenseOperator, EigenEnds, extreme_eigenpairs
 
     operator = DenseOperator(torch.diag(torch.linspace(-2, 7, 12, dtype=torch.float64)))
-    kept = Kept(Stages(), torch.Generator().manual_seed(0), ["ends", "more ends"], lambda: [1], root, "this")
+    kept = Kept(Stages(), torch.Generator().manual_seed(0), ["ends", "more ends"], lambda: 1, root, "this")
     found = [
         kept.run(name, EigenEnds, lambda generator, report, notes: extreme_eigenpairs(operator, generator))
         for name in ("ends", "more ends")

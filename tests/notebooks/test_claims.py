@@ -231,7 +231,7 @@ def test_bounds_of_ten_samples_enclose_the_error_of_a_known_spectrum(least):
              {"participation_ratio": size**2 / (spectrum**2).sum(), "top_mass": spectrum.max() / size}.items()}  # fmt: skip
     end = End(value=spectrum.max(), residual=0.0)
     about: dict = {"metric": "parameters", "unit": "", "operator": "hessian", "block": "quats", "split": False}
-    sizes: dict = {"gaussians": 5, "dim": 20, "rank": 20}
+    sizes: dict = {"gaussians": 5, "rank": 20}
     family = BlockAnisotropy(**about, **sizes, lambda_max=end, lambda_min=end, indices=Anisotropy(**index))
     trace = SimpleNamespace(value=spectrum.sum(), standard_error=0.0)
     data = SimpleNamespace(per_attribute=[family], traces={"quats": trace})

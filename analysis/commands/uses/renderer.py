@@ -125,7 +125,7 @@ def _measured(hessian: RendererHessian, options: ProbeOptions, stages: Stages) -
         row.renders = UNSET if probe is None else record.renders_record(probe)
     off = max((abs(ratio) - 2 * spread for ratio, spread in check.gradients.values()), default=0.0)
     return ProbeRecord(
-        objective=schema.Objective(operator="hessian", value=hessian.value, gradient_norm=float(hessian.gradient.norm())),
+        objective=schema.Objective(value=hessian.value, gradient_norm=float(hessian.gradient.norm())),
         traces={name: record.trace_record(trace) for name, trace in traces.items()},
         eigenvalues=schema.Eigenvalues(max=rows[0], second=rows[1], min=rows[2]),
         anisotropy=record.anisotropy_record(ends, density),

@@ -92,7 +92,7 @@ def projector_of(objective: SceneObjective, *, gauss_newton: bool = False, singl
 def active_spaces(
     objective: SceneObjective, projector: Projector, scale: Float[Tensor, " p"] | None = None
 ) -> dict[str, ActiveSpace]:
-    """Complements of the exact null space, of the whole and of each attribute's block, for `landscape.block_anisotropies`.
+    """Complements of the exact null space, of the whole and of each attribute's block, for `landscape.block_anisotropy`.
 
     projector: of the whole operator (`SceneHessian.projector`).  scale: diagonal of D > 0, 1 by default.  The blocks of
     Gauss-Newton are given the spaces of the Hessian's blocks; they may be flat along more directions.

@@ -36,7 +36,7 @@ class Work:
 
 
 def kept(folder, identity="this", work=None):
-    count = (lambda: [work.count]) if work else (lambda: [])
+    count = (lambda: work.count) if work else (lambda: 0)
     return Kept(Stages(), torch.Generator().manual_seed(0), ["first", "second"], count, folder, identity)
 
 
@@ -49,7 +49,7 @@ def test_a_stage_that_was_kept_is_read_and_not_done_again(tmp_path):
     assert (work.count, again.count) == (1, 0) and read.inner is not None
     assert torch.equal(first.vector, read.vector) and read.error == inf and read.names == {"a": 0.1}
     assert read.inner.vector.dtype == torch.float32 and read.parts[0].shape == (2, 3)
-    assert two.notes == one.notes == ["a note"] and two.counts == one.counts == [1]
+    assert two.notes == one.notes == ["a note"] and two.count == one.count == 1
     assert kept_stages(tmp_path / "kept") == ["first"]
     second = two.run("second", Found, again)  # as if nothing had been kept
     assert torch.equal(second.vector, _alone("second").vector)

@@ -17,6 +17,7 @@ from analysis.measures.depth import (
     gradient_ratio,
     rays_of,
 )
+from analysis.records.schema import Rise
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import TraceSettings
 from splat.curvature.objective import SceneObjective
@@ -123,6 +124,12 @@ def test_probes_have_signs_along_the_rays_or_across_them(objective):
         assert not torch.equal(means[..., 0], means[..., 1])
 
 
+def by_kind(rises: list[Rise], suffix: str = "") -> torch.Tensor:
+    """A row for each length of steps, a column for each of KINDS."""
+    rows = [[getattr(rise, f"{kind}{suffix}") for kind in KINDS] for rise in rises]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
 def test_rises_are_those_of_the_loss_of_each_view():
     loss = LossSettings()
     objective = objective_of(random_gaussians(8, sh_degree=1, seed=4, logit=1.0), loss)
@@ -140,14 +147,14 @@ def test_rises_are_those_of_the_loss_of_each_view():
                 for s, step in enumerate(steps):
                     ends = alone.loss(center + step * u) + alone.loss(center - step * u)
                     rises[s, kind, draw] += (ends / 2 - alone.loss(center)) / 2
-    assert torch.allclose(found.values, rises.mean(dim=2), rtol=1e-9, atol=1e-15)
-    assert torch.allclose(found.errors, rises.std(dim=2) / sqrt(3), rtol=1e-9, atol=1e-15)
-    ratios, errors = found.ratios
-    assert torch.allclose(ratios, found.values[:, 0] / found.values[:, 1])
-    relative = errors / ratios.abs()
-    assert torch.allclose(relative.square(), (found.errors / found.values).square().sum(dim=1))
-    again = depth_rises(objective, generator(), steps, draws)
-    assert torch.equal(again.values, found.values)
+    values, errors = by_kind(found), by_kind(found, "_error")
+    assert torch.allclose(values, rises.mean(dim=2), rtol=1e-9, atol=1e-15)
+    assert torch.allclose(errors, rises.std(dim=2) / sqrt(3), rtol=1e-9, atol=1e-15)
+    assert tuple(rise.pixels for rise in found) == steps
+    for rise, (depth, lateral), relative in zip(found, values.tolist(), (errors / values).square().sum(dim=1).tolist()):
+        assert rise.ratio == pytest.approx(depth / lateral)
+        assert rise.ratio_error == pytest.approx(abs(depth / lateral) * sqrt(relative))
+    assert depth_rises(objective, generator(), steps, draws) == found
 
 
 def test_small_steps_rise_as_the_curvature_says(objective):
@@ -164,8 +171,9 @@ def test_small_steps_rise_as_the_curvature_says(objective):
         depth = torch.einsum("ia,iab,ib->i", v, own, v)
         both = torch.stack([depth, (own.diagonal(dim1=1, dim2=2).sum(dim=1) - depth) / 2])
         expected += (both * lengths.square()).sum(dim=1) / 2 / len(objective.views)
-    assert ((found.values[0] - expected).abs() < 4 * found.errors[0]).all()
-    assert (found.errors[0] < 0.1 * expected.abs()).all()
+    values, errors = by_kind(found)[0], by_kind(found, "_error")[0]
+    assert ((values - expected).abs() < 4 * errors).all()
+    assert (errors < 0.1 * expected.abs()).all()
 
 
 def test_a_step_along_the_rays_that_swaps_two_gaussians_is_seen():
@@ -175,7 +183,8 @@ def test_a_step_along_the_rays_that_swaps_two_gaussians_is_seen():
     ray = torch.nn.functional.normalize(gaussians.means[0] - camera.centre, dim=0)
     gaussians.means[1] = gaussians.means[0] + 1e-6 * ray
     found = depth_rises(objective_of(gaussians, views=1), generator(), (1e-7, 1.0), draws=8)
-    assert found.discontinuous[0].tolist() == [0, 0] and 0 < float(found.discontinuous[1, 0]) < 1
+    small, large = by_kind(found, "_crossed").tolist()
+    assert small == [0, 0] and 0 < large[0] < 1
 
 
 def test_fewer_than_two_draws_are_refused(objective):

@@ -47,7 +47,7 @@ def test_a_needle_has_the_curvature_in_rotation():
     needle = {"means": [0.6, 0.3, 4.0], "log_scales": [-0.8, -5.5, -5.5], "quats": [0.9, 0.0, 0.0, 0.4]}
     found = measured(scene_of([{}, needle, {"means": [-0.6, 0.0, 4.0]}], FRONT))
     assert found.needles == pytest.approx(1 / 3) and found.needles_steepest["quats"] == 1
-    assert found.needles_trace["quats"] > 0.9 and found.condition["50"] < 1.2 < 100 < found.condition["100"]
+    assert found.needles_trace["quats"] > 0.9
 
 
 def test_a_blocker_of_one_view_is_alone_in_it():

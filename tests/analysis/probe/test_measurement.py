@@ -10,7 +10,7 @@ from analysis.measures.per_attribute import PerAttributeOptions
 from analysis.measures.units import optimiser_units
 from analysis.probe import measurement
 from analysis.probe.measurement import measure
-from analysis.probe.plan import compiles, expected_seconds
+from analysis.probe.plan import expected_seconds
 from analysis.probe.settings import ProbeSettings
 from landscape import EigenSettings, TraceSettings, extreme_eigenpairs
 from landscape.eigen.power import power_iteration
@@ -104,15 +104,6 @@ def test_the_paper_s_power_iteration_is_read_from_the_density_without_products()
     ):
         assert abs(float(mine.values - true.values)) < 1e-9 * size and mine.reason == true.reason
         assert abs(float(mine.residuals - true.residuals)) < 1e-8 * size
-
-
-def test_products_are_compiled_where_no_earlier_run_has_kept_them(monkeypatch, tmp_path):
-    objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
-    SceneHessian(objective).apply(objective.active.flat[:, None])  # keeps them, as does any probe
-    cpu = objective.active.flat.device
-    assert not compiles(cpu)
-    monkeypatch.setattr("analysis.probe.plan.config.CACHE_DIR", str(tmp_path))
-    assert compiles(cpu) and not compiles(torch.device("cuda"))
 
 
 def test_a_quick_probe_is_expected_to_take_what_it_makes_alone():

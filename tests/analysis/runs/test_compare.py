@@ -25,7 +25,6 @@ from splat.model.files.splat_ply import splat_ply
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, open_subject, save_checkpoint
-from splat.training.methods.sam import SAM
 from splat.training.origin.fingerprint import FORMULAS
 from tests.figures.test_trajectory_figure import rows
 from tests.recorded import depth_section, long_numbers, own, synthetic, written
@@ -181,19 +180,6 @@ def test_no_ratio_is_compared_whose_end_renders_do_not_confirm(runs, tmp_path, c
         found = table.loc[("anisotropy", name)].isna()
         assert found.tolist() == [True, False]
     assert capsys.readouterr().out.count("not confirmed by renders") == 1
-
-
-def test_runs_with_the_same_parameters_are_said_to_be_the_same(runs, capsys, no_pictures):
-    shutil.copy(Path(runs[0]) / "checkpoint.pt", Path(runs[1]) / "checkpoint.pt")
-    record(Path(runs[1]) / "probe", 0.5)
-    assert main(["compare", *runs]) == 0
-    assert capsys.readouterr().out.startswith("sam/0: parameters are identical to plain/0.")
-    changed(runs[1], method=SAM())
-    assert main(["compare", *runs]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("sam/0: the method never acted: parameters are identical to plain/0.")
-    page = (Path(runs[0]).parents[1] / "compare/compare.html").read_text()
-    assert page.index("never acted") < page.index("<h2>Pictures") < page.index("<h2>Numbers")
 
 
 def test_seeds_are_compared_by_mean_and_spread(runs, capsys, no_pictures, tmp_path):

@@ -24,16 +24,13 @@ def probed(loss, center=CENTER, steps=STEPS, **more):
     return finite_probe(loss, center, V.to(center.dtype), DenseOperator(A), steps, **more)
 
 
-def test_a_finite_step_sees_the_fourth_derivative_and_says_how_much_of_it():
+def test_a_finite_step_sees_the_fourth_derivative():
     found = probed(quartic)
     exact = float(V @ A @ V)
     assert found.infinitesimal == pytest.approx(exact, rel=1e-14)
     # c(d) = v.Av + 2 QUARTIC d^2, a step of d V being one of d along V / |V|^2
     expected = exact + 2 * QUARTIC * found.steps.square()
     assert ((found.curvatures - expected).abs() <= found.round_off).all()
-    told = (found.truncation - 2 * QUARTIC * found.steps.square()).abs()
-    assert (told <= 2 * found.round_off).all()
-    assert found.best is not None and abs(float(found.curvatures[found.best]) - exact) < 1e-5
     assert found.discontinuous is None and found.evaluations == 2 * len(STEPS) + 1 + NOISE_POINTS
 
 
@@ -128,8 +125,7 @@ def test_across_a_kink_the_probe_sees_two_slopes_and_marks_them():
         return 1 + abs(along - 0.01), along > 0.01
 
     found = probed(kinked, steps=(0.001, 0.1, 1.0))
-    assert found.discontinuous is not None and found.discontinuous.tolist() == [False, True, True] and found.best == 0
-    assert probed(kinked, steps=(0.1, 1.0)).best is None
+    assert found.discontinuous is not None and found.discontinuous.tolist() == [False, True, True]
     # |d - a| + |d + a| - 2 a = 2 (d - a) for d > a
     assert found.curvatures[1:].tolist() == pytest.approx([2 * 0.09 / 0.01, 2 * 0.99], rel=1e-10)
     assert abs(float(found.curvatures[0])) <= float(found.round_off[0])
@@ -140,7 +136,7 @@ def test_the_record_is_plain_and_what_is_not_finite_is_none():
         return float("inf") if float((theta - CENTER) @ V / (V @ V)) > 0.5 else quartic(theta)
 
     record = probed(wall, steps=(0.01, 0.1, 1.0)).record()
-    assert record["steps"] == [0.01, 0.1, 1.0] and record["crossed"] is None and record["best"] == 0
+    assert record["steps"] == [0.01, 0.1, 1.0] and record["crossed"] is None
     assert isinstance(record["curvatures"], list) and record["curvatures"][2] is None
 
 

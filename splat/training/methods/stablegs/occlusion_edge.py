@@ -6,10 +6,9 @@ pixels in use   those whose 3 x 3 neighbourhood is covered everywhere (alpha at 
                 space there is no second surface whose order could be wrong, and the mean depth of faint pixels is noise
 edges           the share STRONGEST of the pixels in use with the largest gradient, if it is above FLAT
 structure       S = sum over edges of grad D grad D^T, with eigenvalues a >= b; its first eigenvector is the normal
-coherence       (a - b) / (a + b): 1 where all edges are parallel, 0 where no direction dominates
 """
 
-from math import atan2, ceil, cos, hypot, sin
+from math import atan2, ceil, cos, sin
 
 import torch
 from jaxtyping import Float
@@ -21,23 +20,22 @@ FLAT = 1e-4  # relative gradient of depth, per pixel: above round-off of composi
 
 
 @torch.no_grad()
-def dominant_edge(depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "2"], float]:
-    """Unit normal (x, y) of the strongest depth edges, across them in the image, and their coherence.
+def dominant_edge(depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]) -> Float[Tensor, "2"]:
+    """Unit normal (x, y) of the strongest depth edges, across them in the image.
 
     depth (not divided by alpha), alpha: of `splat.render.render.render(..., depth=True)`.  The result is detached from
-    autograd.  The sign of the normal is arbitrary: x >= 0.  Without edges both are 0.
+    autograd.  The sign of the normal is arbitrary: x >= 0.  Without edges it is 0.
     """
     gradient, relative = _gradients(depth, alpha)
     steep = relative > FLAT
     if not bool(steep.any()):
-        return depth.new_zeros(2), 0.0
+        return depth.new_zeros(2)
     length = gradient.norm(dim=1)
     threshold = length.kthvalue(len(length) - ceil(STRONGEST * len(length)) + 1).values
     x, y = gradient[steep & (length >= threshold)].double().unbind(-1)
     xx, xy, yy = float(x @ x), float(x @ y), float(y @ y)
     angle = atan2(2 * xy, xx - yy) / 2  # of the first eigenvector of [[xx, xy], [xy, yy]], in [-90, 90] degrees
-    coherence = hypot(2 * xy, xx - yy) / (xx + yy)
-    return depth.new_tensor([cos(angle), sin(angle)]), coherence
+    return depth.new_tensor([cos(angle), sin(angle)])
 
 
 def _gradients(

@@ -244,7 +244,7 @@ class StableGSMethod(Method[StableGS]):
         if settings.vsp_weight and settings.viewpoint.edge_rotation:
             with torch.no_grad():
                 depths = (render_depth(step.gaussians, view.camera, step.config.render) for view in step.views)
-                self.normals = [dominant_edge(depth, alpha)[0] for depth, alpha in depths]
+                self.normals = [dominant_edge(depth, alpha) for depth, alpha in depths]
 
     def traces(self, objective: SceneObjective, *, sampled: bool = True) -> dict[str, TraceEstimate]:
         """Traces of the Hessian's blocks of the probed attributes.  sampled: whether the coupling of pixels is sampled anew."""

@@ -28,12 +28,11 @@ def test_the_normal_of_a_depth_step_is_across_it(degrees: float) -> None:
     softness = 3.0
     across = (x * cos(radians(degrees)) + y * sin(radians(degrees))) / (softness * 2**0.5)
     depth = 3 + torch.erf(across)
-    normal, coherence = dominant_edge(depth, torch.ones_like(depth))
+    normal = dominant_edge(depth, torch.ones_like(depth))
     # Sobel turns a wave of k px^-1 by k^2 sin(4 angle) / 48; here the mean k^2 is 1 / (2 softness^2).  Twice that: the
     # strongest edges are not the whole profile
     assert angle_between(normal, degrees) < 2 / (96 * softness**2)
     assert normal.norm().item() == pytest.approx(1, rel=1e-12) and normal[0] >= 0
-    assert coherence > 1 - 1e-3
 
 
 def test_the_normal_is_the_first_eigenvector_of_the_structure_tensor() -> None:
@@ -41,10 +40,9 @@ def test_the_normal_is_the_first_eigenvector_of_the_structure_tensor() -> None:
     depth[:, 20:] += 3
     gradient = kornia.filters.spatial_gradient(depth[None, None])[0, 0, :, 1:-1, 1:-1].reshape(2, -1).numpy()
     strongest = gradient[:, np.argsort(-np.hypot(*gradient))[: int(np.ceil(0.05 * gradient.shape[1]))]]
-    values, vectors = np.linalg.eigh(strongest @ strongest.T)
-    normal, coherence = dominant_edge(depth, torch.ones_like(depth))
+    _, vectors = np.linalg.eigh(strongest @ strongest.T)
+    normal = dominant_edge(depth, torch.ones_like(depth))
     assert abs(normal.numpy() @ vectors[:, 1]) == pytest.approx(1, rel=1e-12)
-    assert coherence == pytest.approx((values[1] - values[0]) / values.sum(), rel=1e-10)
 
 
 @pytest.mark.parametrize(("dtype", "round_off"), [(torch.float32, 1e-5), (torch.float64, 1e-14)])
@@ -62,7 +60,7 @@ def test_many_weak_edges_do_not_outvote_a_strong_one() -> None:
     depth[:, 48:] = 7
     alpha = torch.ones_like(depth)
     alpha[:, 32] = 0  # nothing is seen across the gap
-    normal, _ = dominant_edge(depth * alpha, alpha)
+    normal = dominant_edge(depth * alpha, alpha)
     assert normal.tolist() == pytest.approx([1, 0], abs=1e-12)
 
 
@@ -71,8 +69,7 @@ def test_the_mean_depth_counts_and_not_how_much_covers_it() -> None:
     alpha = 0.7 + 0.2 * torch.sin(0.9 * y)
     mean = 4 + torch.erf(x / 3)
     expected, given = dominant_edge(mean, torch.ones_like(mean)), dominant_edge(mean * alpha, alpha)
-    assert given[0].tolist() == pytest.approx(expected[0].tolist(), abs=1e-12)
-    assert given[1] == pytest.approx(expected[1], rel=1e-9)
+    assert given.tolist() == pytest.approx(expected.tolist(), abs=1e-12)
 
 
 def test_the_outline_against_nothing_and_faint_pixels_are_no_edges() -> None:
@@ -81,18 +78,18 @@ def test_the_outline_against_nothing_and_faint_pixels_are_no_edges() -> None:
     alpha = torch.where(disc, 1.0, 0.01 * torch.rand(x.shape, generator=torch.Generator().manual_seed(0)).double())
     noise = torch.rand(x.shape, generator=torch.Generator().manual_seed(2)).double()
     depth = torch.where(disc, 4.0, 10 * noise * alpha)
-    assert dominant_edge(depth, alpha)[1] == 0
+    assert not dominant_edge(depth, alpha).any()
     inside = torch.where(disc & (y > 0), 5.0, depth)
-    normal, coherence = dominant_edge(inside, alpha)
-    assert normal.tolist() == pytest.approx([0, 1], abs=1e-12) and coherence == pytest.approx(1, rel=1e-12)
+    normal = dominant_edge(inside, alpha)
+    assert normal.tolist() == pytest.approx([0, 1], abs=1e-12)
 
 
 @pytest.mark.parametrize("size", [(40, 50), (2, 50), (1, 1)])
 @pytest.mark.parametrize("covered", [0.0, 1.0])
 def test_a_map_without_edges_has_no_axis(size: tuple[int, int], covered: float) -> None:
     alpha = torch.full(size, covered)
-    normal, coherence = dominant_edge(7.3 * alpha, alpha)
-    assert normal.tolist() == [0, 0] and coherence == 0
+    normal = dominant_edge(7.3 * alpha, alpha)
+    assert normal.tolist() == [0, 0]
 
 
 def test_round_off_is_no_edge() -> None:
@@ -102,10 +99,10 @@ def test_round_off_is_no_edge() -> None:
     for weight in 2 * weights:
         depth, alpha = depth + weight * 7.3, alpha + weight
     assert (depth / alpha).unique().numel() > 1
-    assert dominant_edge(depth, alpha)[1] == 0
+    assert not dominant_edge(depth, alpha).any()
 
 
 def test_the_axis_is_a_constant_to_the_derivative() -> None:
     x, _ = grid()
     depth = (3 + torch.erf(x)).requires_grad_()
-    assert not dominant_edge(depth, torch.ones_like(depth))[0].requires_grad
+    assert not dominant_edge(depth, torch.ones_like(depth)).requires_grad
