@@ -53,6 +53,11 @@ class Workload:
     loss: LossSettings = LossSettings()
     settings: RenderSettings = RenderSettings()
 
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of one view."""
+        return self.views[0].camera.width * self.views[0].camera.height
+
     def to(self, device: torch.device) -> "Workload":
         """The Gaussians on a device, where all that is computed of them is then computed; views stay where they are."""
         return replace(self, gaussians=self.gaussians.with_flat(self.gaussians.flat.to(device)))

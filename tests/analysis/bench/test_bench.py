@@ -79,11 +79,15 @@ def test_memory_is_that_of_the_arrays(bench):
         assert least <= bench.workspace(K, Meter()) <= view.workspace(K) + blocks + objects
 
 
-def test_a_bench_records_times(recorded):
-    assert [p.name for p in recorded.iterdir()] == ["bench.csv"]
-    table = pd.read_csv(recorded / "bench.csv")
+def test_a_bench_records_times_and_the_bounds_that_are_asked(recorded):
+    assert sorted(p.name for p in recorded.iterdir()) == ["bench.csv", "bounds.csv"]
+    table, bounds = pd.read_csv(recorded / "bench.csv"), pd.read_csv(recorded / "bounds.csv")
     assert (table[["minimum_ms", "median_ms"]].to_numpy() > 0).all()
-    assert {"gradient", "linearize", "H v 1", "H v 8", "block diagonal", "exact blocks"} <= {*table["stage"]}
+    time, ratio = dict(zip(table["stage"], table["minimum_ms"])), dict(zip(bounds["what"], bounds["measured"]))
+    assert {"gradient", "linearize", "H v 1", "H v 8", "block diagonal", "exact blocks"} <= time.keys()
+    assert ratio["H v 4 / gradient"] == pytest.approx(time["H v 4"] / time["gradient"])
+    limit = bounds["asked"].str.removeprefix("≤ ").astype(float)
+    assert (bounds["holds"] == (bounds["measured"] <= limit)).all()
 
 
 def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
@@ -96,7 +100,7 @@ def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
     run = ["--views", "3", "--iterations", "2", "--out", str(tmp_path / "run")]
     assert main(["train", str(tmp_path / "scene"), *run]) == 0
     trained = workload_of(tmp_path / "run" / "checkpoint.pt")
-    assert len(trained.views) == 3 and trained.views[0].image.shape == (3, 18, 24)
+    assert len(trained.views) == 3 and trained.pixels == 24 * 18
     objective = SceneObjective(trained.gaussians, trained.views, trained.loss, trained.background, trained.settings)
     assert objective.counts.gaussians == len(trained.gaussians)
 
