@@ -22,7 +22,7 @@ from splat.training.origin.options import Foreign
 if TYPE_CHECKING:
     from splat.training.origin.subject import Subject
 
-PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib", "plotly")
+PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib")
 
 
 class Machine(Struct, kw_only=True):

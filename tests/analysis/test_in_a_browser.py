@@ -38,7 +38,6 @@ def test_the_report_draws_moves_and_asks_for_nothing(browser, tmp_path):
     path = with_views(tmp_path / "probe", ["a.png", "b.png"])
     requests_of(browser)
     browser.get(path.as_uri())
-    until(browser, "document.querySelector('#surface .main-svg') !== null")
     assert until(browser, "[...document.images].every(image => image.complete && image.naturalWidth > 0)")
     keys_to(browser, "#chosen", "\ue014")  # the right arrow
     assert until(browser, "document.querySelector('#views img').alt.endsWith('b.png')")
@@ -53,30 +52,10 @@ def test_nothing_of_the_page_is_cut_or_scrolls_sideways(browser, tmp_path, width
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     browser.get(path.as_uri())
     browser.execute_script("document.querySelectorAll('details').forEach(each => each.open = true)")
-    beyond = "[...document.body.querySelectorAll('*')].filter(each => !each.closest('.scroll, #guard, svg')"
+    beyond = "[...document.body.querySelectorAll('*')].filter(each => !each.closest('.scroll, svg')"
     beyond += " && each.getBoundingClientRect().right > innerWidth + 1).map(each => each.outerHTML.slice(0, 80))"
     assert browser.execute_script(f"return [document.documentElement.scrollWidth <= {width}, {beyond}]") == [True, []]
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-
-
-def test_the_wheel_scrolls_the_page_until_the_surface_was_clicked(browser, tmp_path):
-    from selenium.webdriver import ActionChains
-    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
-
-    browser.get(with_views(tmp_path / "probe", ["a.png"]).as_uri())
-    until(browser, "document.querySelector('#surface .main-svg') !== null")
-    guard = browser.find_element("id", "guard")
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", guard)
-    turn = ActionChains(browser).scroll_from_origin(ScrollOrigin.from_element(guard), 0, -100)
-    before = browser.execute_script("return window.scrollY")
-    turn.perform()
-    until(browser, f"window.scrollY < {before}")
-    ActionChains(browser).move_to_element(guard).click().perform()
-    until(browser, "document.getElementById('guard').className === 'on'")
-    before = browser.execute_script("return window.scrollY")
-    turn.perform()
-    browser.execute_async_script("setTimeout(arguments[0], 500)")
-    assert browser.execute_script("return window.scrollY") == before
 
 
 @pytest.fixture

@@ -1,11 +1,10 @@
 """A self-contained page about one record: where the curvature is, the summary, the pictures, and every number, folded.
 
-The page carries its pictures and plotly.js (compressed) within it, and its content security policy forbids every request
-to a network.  Text from the record is escaped.
+The page carries its pictures within it, and its content security policy forbids every request to a network.  Text from the
+record is escaped.
 """
 
 import base64
-import gzip
 import html
 import io
 import math
@@ -13,7 +12,6 @@ import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,7 @@ from analysis.records.findings import Line, attribute_name, findings, shares_per
 from analysis.records.json_files import plain
 from analysis.records.page.summary import told
 from analysis.records.provenance import Provenance
-from analysis.records.quantities import exponent_of, percent, quantity, ratio, rough, unit_suffix
+from analysis.records.quantities import percent, quantity, ratio, rough
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map, read_maps
 from analysis.records.schema import INDICES
@@ -81,7 +79,6 @@ GLOSSARY = {  # of the words that a page uses
 OPTION = re.compile(r"--[a-z][a-z-]*")  # of a command, which a page must not break
 THINNEST = 2.0  # px, half axes of an outline
 ROOM, SMALLEST = 3.0, 6  # of the part around an outline: in its half length; at least 1 / SMALLEST of the picture
-PACKED = 4  # level of gzip of plotly.js: at the usual 6 it takes twice as long for 4% fewer bytes
 
 
 def write_report(folder: str | Path) -> Path:
@@ -124,14 +121,11 @@ def render_report(record: Record[ProbeRecord]) -> str:
 
 
 def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line]) -> str:
-    """Pictures and plotly.js are compressed in parallel."""
     data, run = record.data, record.folder.parent
-    surface = interactive_surface(record)
     lines, numbers = told(data), number_rows(data)
     numbers.pop("Sizes", None)  # the counts have them
     captions = PICTURES | ({"traces": COMPARED} if shares_per_trace(data) else {})
     with ThreadPoolExecutor() as pool:
-        packed = pool.submit(_packed_plotly) if surface else None
         pictures = pool.submit(pictures_in, record.folder, captions, shown_numbers(record))
         places = pool.submit(map_pictures, run / MAP, mapped)
         views = views_in(record, mapped)
@@ -159,8 +153,6 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
         splats=f"../{SPLATS}" if (run / SPLATS).is_file() else "",
         per_attribute=family_lines(data),
         indices=INDICES,
-        surface=surface,
-        plotly_js=packed.result() if packed else "",
     )
     shown = html.unescape(re.sub(r"<(style|script)>.*?</\1>|<[^>]*>", " ", text, flags=re.DOTALL))
     used = [
@@ -298,56 +290,6 @@ def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:
 
 def data_uri(content: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def interactive_surface(record: Record[ProbeRecord]) -> dict[str, Any] | None:
-    """Data and layout for plotly.js of the recorded slice as a surface, with the quadratic model where known; None without one.
-
-    Written without plotly's Python package, whose import is slow.
-    """
-    about = record.data.slice
-    if about is None or "slice" not in record.arrays or not about.is_resolved:
-        return None
-    arrays = record.arrays["slice"]
-    loss = np.where(np.isfinite(arrays["loss"]), arrays["loss"], np.nan) - about.center_loss
-    low, high = float(np.nanmin(loss)), float(np.nanmax(loss))
-    exponent = exponent_of(loss)
-    low, high = low / 10.0**exponent, (high if high > low else low + 1) / 10.0**exponent
-    layers = [("loss", "loss", "Cividis", 1.0), ("model", "quadratic model", "Greys", 0.45)]
-    surfaces = [
-        {
-            "type": "surface", "x": _listed(arrays["x"]), "y": _listed(arrays["y"]), "name": label, "colorscale": colours,
-            "z": _listed((arrays[name] - about.center_loss).T / 10.0**exponent), "opacity": opacity, "showlegend": True,
-            "showscale": name == "loss", "visible": True if name == "loss" else "legendonly", "cmin": low, "cmax": high,
-            "colorbar": {"len": 0.8},
-        }
-        for name, label, colours, opacity in layers if name in arrays
-    ]  # fmt: skip
-    steps = [
-        {"title": {"text": f"step along {html.escape(each.name, quote=False)}"}, "exponentformat": "power"}
-        for each in about.directions
-    ]  # plotly reads some tags in its texts
-    change = {"title": {"text": f"change of loss{unit_suffix(exponent)}"}, "range": [low, high]}
-    camera = {
-        "eye": {"x": 0.7, "y": -1.1, "z": 1.5},
-        "center": {"x": 0, "y": 0, "z": -0.1},
-    }  # so steep that no wall hides it
-    box = {"aspectmode": "manual", "aspectratio": {"x": 1, "y": 1, "z": 0.5}}  # as high as half its width
-    scene = {"xaxis": steps[0], "yaxis": steps[1], "zaxis": change, "camera": camera, **box}
-    layout = {"scene": scene, "margin": dict.fromkeys("lrtb", 0), "height": 520, "legend": {"orientation": "h"}}
-    return {"data": surfaces, "layout": layout}
-
-
-def _listed(values: np.ndarray) -> list[Any]:
-    """Numbers for JSON, to as many digits as a picture shows; None for what is not finite."""
-    if values.ndim > 1:
-        return [_listed(row) for row in values]
-    return [float(f"{value:.7g}") if math.isfinite(value) else None for value in values.tolist()]
-
-
-def _packed_plotly() -> str:
-    content = files("plotly").joinpath("package_data/plotly.min.js").read_bytes()
-    return base64.b64encode(gzip.compress(content, PACKED, mtime=0)).decode()
 
 
 def pictures_in(
