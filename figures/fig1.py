@@ -3,8 +3,8 @@
 `python -m figures.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint
 along the two steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1, e_2), under its step,
 the largest eigenvalue, how many times that of the first run it is, and whether renders confirm it (by the probe, if there is
-one); below, the photograph of the first view that both have rendered, and both renders with their PSNR.  Both share their axes
-(`manifold`).
+one); below, of the first view that both have rendered, the third of each side in which the renders differ most: the photograph,
+and both renders, with the view's PSNR and the error in this part.  Both share their axes (`manifold`).
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
+from scipy.ndimage import uniform_filter
 
 from analysis.console.failures import program
 from analysis.records.quantities import rough
@@ -57,13 +58,14 @@ def draw(runs: Sequence[Path]) -> Figure:
         figure = new_figure(7.4, WIDTH)
         above, below = figure.subfigures(2, 1, height_ratios=[3.6, 1], squeeze=False)[:, 0]
         maps = [above.add_subplot(3, 2, 3 + i) for i in range(len(runs))]
-        photograph = _photograph(runs[0], view)
+        photograph, renders = _photograph(runs[0], view), [imread(run / RENDERS / view) for run in runs]
+        part = most_different(*renders)
         pictures = below.subplots(1, len(runs) + (photograph is not None), squeeze=False)[0]
         for axes in pictures:
             axes.axis("off")
         if photograph is not None:
-            pictures[0].imshow(photograph)
-            pictures[0].set_title(f"held-out view\n{literal(view)}")
+            pictures[0].imshow(photograph[part])
+            pictures[0].set_title(f"part of {literal(view)}\n(held out)")
         for i, (run, name, landscape) in enumerate(zip(runs, names, landscapes, strict=True)):
             surface(above, (3, 2, 1 + i), landscape, scale, _heading(i, runs, names, landscapes))
             filled = contours(maps[i], landscape, scale)
@@ -72,8 +74,11 @@ def draw(runs: Sequence[Path]) -> Figure:
                 section(across, landscape, sections, axis, color=colour)
             across.set_xlabel(scale.flat_label("e₁, e₂"))
             picture = pictures[i - len(runs)]
-            picture.imshow(imread(run / RENDERS / view))
-            picture.set_title(f"{literal(name)}\n{_score(run, view)}")
+            picture.imshow(renders[i][part])
+            error = (
+                "" if photograph is None else f"; here ±{rough(float(np.abs((renders[i] - photograph)[part]).mean()))}"
+            )
+            picture.set_title(f"{literal(name)}\n{_score(run, view)}{error}")
             if i == 0:
                 across.set_ylabel(sections.loss_label)
             else:
@@ -85,6 +90,22 @@ def draw(runs: Sequence[Path]) -> Figure:
         figure.set_label(_caption(names, landscapes))
         above.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
+
+
+def most_different(first: np.ndarray, second: np.ndarray) -> tuple[slice, slice]:
+    """The part of two renders (h, w, 3), a third of each side, in which they differ most.
+
+    >>> change = np.zeros((9, 9, 3))
+    >>> change[8, 4] = 1
+    >>> most_different(change, np.zeros((9, 9, 3)))
+    (slice(6, 9, None), slice(2, 5, None))
+    """
+    change = np.abs(first - second).sum(axis=2)
+    size = [max(side // 3, 1) for side in change.shape]
+    inner = tuple(slice(part // 2, part // 2 + side - part + 1) for side, part in zip(change.shape, size, strict=True))
+    means = uniform_filter(change, size)[inner]  # pyright: ignore[reportArgumentType]
+    top, left = map(int, np.unravel_index(int(means.argmax()), means.shape))
+    return slice(top, top + size[0]), slice(left, left + size[1])
 
 
 def _heading(i: int, runs: Sequence[Path], names: Sequence[str], landscapes: Sequence[Plane]) -> str:
