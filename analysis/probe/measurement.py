@@ -1,12 +1,12 @@
 """Stages of `landscape probe` at one point of a scene's loss with Hessian H.
 
-    linearise           derivatives of every view, the diagonal block of every Gaussian in H, a first render
+    linearise           derivatives of every view, the gradient, a first render
     checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
     traces              of each attribute's block: exact, but for SSIM's window, which is sampled where that
-                        is cheaper
+                        is cheaper, and always in a quick probe or on a GPU
     eigenvalues         the two largest and the smallest, from the start vectors of `splat.curvature.block_eigenvectors`
     renders             the second difference of the loss along the eigenvectors of both ends, at steps that double, from a part
-                        of the optimiser's to one at which the curvature alone changes the loss by 1%; the Gaussian that
+                        of the optimiser's to about one at which the curvature alone changes the loss by 1%; the Gaussian that
                         carries each end; the loss after random steps of the optimiser in each attribute
     slice               the loss over the plane of the first two eigenvectors: rendered where needed, interpolated elsewhere
     density *           stochastic Lanczos quadrature, for sums of |lambda|; the Krylov spaces of its first runs
@@ -14,7 +14,7 @@
     depth *             the positions' gradient and curvature along the rays and across them, and finite steps both ways
 
 * not in a quick probe.  Estimators stop at their accuracy or at a limit on products; their results say which.  Numbers depend
-on the seed alone, also those of stages kept from an earlier run.
+on the seed, and on free memory where a note says so; also those of stages kept from an earlier run.
 """
 
 from collections.abc import Sequence
@@ -77,11 +77,11 @@ LEFT_OUT = {  # notes on stages that the settings exclude
     "density": "the spectral density was left out, and the indices that need it",
     "depth": "positions along and across the rays were left out",
 }
-# steps of renders along the ends: change of the loss by the longest, at most; from the optimiser's step to the shortest (three
-# such, a factor of 2 apart, reach a tenth of it) and to the longest
+# renders along the ends: from the optimiser's step HALVINGS halvings down (so that three reach a tenth of it), and up to the
+# first doubling at which the curvature changes the loss by RISE, but 1 to MOST_DOUBLINGS doublings
 RISE, HALVINGS, MOST_DOUBLINGS = 0.01, 5, 5
-MIXED = 0.1  # largest error of an eigenvector whose spread is told: 1% of its mass lies elsewhere
-FEW_POINTS = 8  # renders that tell the noise of one
+MIXED = 0.1  # largest error of an eigenvector whose participation is recorded: 1% of its mass lies elsewhere
+FEW_POINTS = 8  # renders for the estimate of a render's noise
 MOST_SAMPLES = 64  # of a trace on a CPU: more would take longer than summing the exact blocks
 
 
@@ -98,7 +98,7 @@ def measure(
 ) -> Measured:
     """Run every stage.
 
-    steps: the optimiser's first in each parameter.  folder, identity: see `Kept`.  population:
+    steps: length of the optimiser's first step in each parameter.  folder, identity: see `Kept`.  population:
     number of training views, where the objective has fewer.  ranks: processes that all measure the same, and share the views of
     the operator's products.
     """
@@ -220,7 +220,7 @@ def _ends(at: _Point, generator: torch.Generator, report: Progress, notes: list[
 
 
 def _spreads(pairs: Sequence[Eigenpairs], gaussians: Gaussians) -> list[tuple[float, float]]:
-    """Eigenvalue, and participation over Gaussians, of the first TEN pairs, up to one that its neighbours are mixed into."""
+    """Eigenvalue, and participation over Gaussians, of the first TEN pairs, to the first whose vector error is above MIXED."""
     rows = []
     for some in pairs:
         for i in range(len(some)):
@@ -306,7 +306,7 @@ def plane_of(
     report: Progress,
     notes: list[str],
 ) -> PlaneSlice | None:
-    """The loss over the plane of the two steepest directions; None where a note says why.  value, gradient: at center."""
+    """The loss over the plane of the first two eigenvectors; None where a note says why.  value, gradient: at center."""
     loss_scale, curvatures = settings.slice_rise * value, ends.largest.values[:2]
     if loss_scale <= 0 or not curvatures.all():
         notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")

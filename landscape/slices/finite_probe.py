@@ -3,13 +3,13 @@
     c(d) = (L(theta + d v) - 2 L(theta) + L(theta - d v)) / d^2  =  v.H v + d^2 L4 / 12 + ...       L4 = d^4 L / dv^4
 
 round-off   4 sqrt(6 noise^2 + 2 (d s)^2) / d^2: four standard errors of a second difference of values with independent errors.
-            s = eps |theta * H v| / sqrt(12): the rounding of theta + d v, times the slope d H v there
+            d s, s = eps |theta * H v| / sqrt(12): the rounding of theta + d v, times the slope d H v there
 confirmed   a step where c(d) is beyond its round-off, has the sign of v.H v, and is between half and twice it.  A curvature is
-            confirmed by three such steps, each twice the one before: the curvature 2 |d| / d^2 of a kink is halved from one to
-            the next, so that it never is
-refuted     a step where no value within the round-off of c(d) is such.  Round-off grows as 1 / d^2, and hides the
-            shortest steps of any loss: it leaves a curvature open only where no longer step refutes it, or where steps beside
-            those that it hides confirm it
+            confirmed by three such steps, each twice the one before: the curvature 2 |d| / d^2 of a kink at the
+            centre is halved from one to the next, so that it never is
+refuted     a step where no value within round-off of c(d) is between half and twice v.H v.  Round-off grows as d shrinks, by
+            up to 1 / d^2, and hides the shortest steps of any loss: a curvature stays open only where no step is refuted, or
+            where three in a row are partly confirmed and none refuted
 noise       standard deviation of the error of one value of L, from differences of order k = 4 of values at small even steps
             along v, in which the smooth part of L cancels: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and
             Wild 2011, Sec. 2).  At least the resolution of the numbers that the objective returns (Python floats that are all
@@ -37,7 +37,7 @@ ORDER, NOISE_POINTS = 4, 24  # order of the differences, number of values
 CLOSER = 4  # the distance between these values is the smallest step over this ...
 ROUNDINGS = 4  # ... but at least this many round-offs of the parameters, so that each value is rounded differently
 WITHIN, RUN = 2.0, 3  # largest factor between c(d) and v.H v; consecutive steps that confirm
-STEPS = tuple(10.0 ** (k / 2) for k in range(-10, 1))
+STEPS = tuple(10.0 ** (k / 2) for k in range(-10, 1))  # for curves: `confirmation` needs steps that double
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,10 +59,10 @@ class FiniteProbe(ShortRepr):
     evaluations: int
 
     def confirmation(self, least: float) -> tuple[bool | None, tuple[float, float] | None]:
-        """Whether renders, say, confirm v.H v, and the shortest and longest of the steps that do; steps double.
+        """Whether the loss confirms v.H v, and the ends of the last unbroken run of steps that do; steps must double.
 
-        True where RUN consecutive steps, the longest of at least `least`, confirm it; None where without round-off they might:
-        some of them do and none refutes it, or no step of at least `least` refutes it; else False.
+        True where RUN consecutive steps, the longest of at least `least`, confirm it; None, open, where of RUN such steps some
+        confirm and none refutes it, or no step of at least `least` refutes it; else False.
         """
         ratio, error = self.curvatures / self.infinitesimal, self.round_off / abs(self.infinitesimal)
         good = (ratio >= 1 / WITHIN) & (ratio < WITHIN) & (ratio > error)

@@ -5,13 +5,13 @@
     half      the least number of directions that hold half of it
                                              = max over t > 0 of [F(0) / 2 - F(t)] / t
 
-between whole k linear in k.  The first line is the dual of a linear programme, known from finance as conditional value at risk
-(Rockafellar and Uryasev 2000); the third solves it for k.  So both need sums of one function of each eigenvalue, and of such a
-sum every start vector's moments say where it ends to either side: F is a function of a kink at t and one of a kink at -t,
-and each has its least and largest integral among `rules_of_moments`.  Rules by themselves would make sums too small: a node
-stands for many eigenvalues as if they were alike.
+S is linear in k between whole k.  The first line is the dual of a linear programme, known from finance as conditional value
+at risk (Rockafellar and Uryasev 2000); the third solves it for k.  Both need F alone.  max(|x| - t, 0) is max(x - t, 0), with
+a kink at t, plus max(-x - t, 0), with one at -t; a start vector's moments bound the integral of each, and
+`rules_of_moments` has the rules that reach these bounds.  One rule alone mostly makes S too small: a node stands for many
+eigenvalues as if they were alike.
 
-A bracket is that of the bounds, from the mean of F over start vectors, widened by Student's interval over them.
+A bracket is the number at the bounds of F (means over start vectors), widened by Student's interval for their spread.
 """
 
 from collections.abc import Callable

@@ -16,7 +16,8 @@ ROUND_OFFS = 10  # of the sum of squares: a smaller spread of the other controls
 
 
 def controlled(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> Float64[Tensor, " s"]:
-    """samples - c (control - mean), where c is fitted for each sample to all others by least squares (0 if these are equal).
+    """samples - c (control - mean), where c is fitted for each sample to all others by least squares (0 if their controls are
+    equal; fewer than 3 samples are returned as they are).
 
     >>> x = torch.tensor([1.0, 2.0, 4.0, 8.0]).double()
     >>> controlled(3 * x + 5, x, mean=2.0).round(decimals=9)  # 3 x + 5 has the mean 11, and x explains all of it

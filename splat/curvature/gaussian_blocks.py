@@ -21,7 +21,7 @@ GEOMETRY_COLUMNS = {
 class PerGaussianBlocks(ShortRepr):
     """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH.
 
-    views: of blocks that are a mean over views, `traces` of each view's blocks, or nothing.
+    views: for a mean over views, the `traces` of each view's blocks; else empty.
     """
 
     geometry: Float[Tensor, "n 11 11"]
@@ -41,7 +41,7 @@ class PerGaussianBlocks(ShortRepr):
     def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
         """Trace of each attribute's block, summed in double precision.
 
-        quats: unit quaternions, which P projects out: of P B P instead of B.  scale: the diagonal of D, of D P B P D instead.
+        quats: unit quaternions; P projects them out, and traces are of P B P.  scale: diag D; traces are of D P B P D.
         """
         diagonals = self.diagonals if quats is None else self.diagonals_across(quats)
         if scale is not None:

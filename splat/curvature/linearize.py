@@ -11,12 +11,12 @@ A prime is a derivative.  With g = l' (the gradient in I) and a = C'^T g,
 Regularisers are added to value, gradient and H u; they have no part in G u.
 
 P' and a . P'' of the Gaussians that reach a tile before its pixels stop, tile lists, final transmittances, g and a are
-computed once.  H U is then two passes over the pixels for K vectors together, the columns of U (p, K), laid out like
+computed once.  H U is then two passes over the pixels for k vectors together, the columns of U (p, k), laid out like
 `Gaussians.flat`; G U takes one for all vectors, and one more for each.
-Constant is what is so piecewise: the order of the splats, the alpha_min cut, where a pixel stops, which clamps hold.
+Taken as constant, as they are piecewise: the order of the splats, the alpha_min cut, where a pixel stops, which clamps hold.
 
-Shapes: p parameters, n splats, k vectors (K above), 9 numbers of a splat (place, inverse covariance, opacity, colour), h x w
-pixels of the image, H x W of whole tiles, 4 planes: red, green, blue, accumulated alpha.
+Shapes: p parameters, n splats, k vectors, 9 numbers of a splat (place, inverse covariance, opacity, colour), h x w
+pixels of the image, H x W (in shapes) of whole tiles, 4 planes: red, green, blue, accumulated alpha.
 
 Tangents and adjoints of splats are in the coordinates of `projection/whitening.py`.  On a GPU, products do not synchronise with
 the device.
@@ -104,7 +104,7 @@ class LinearizedView:
 
     @property
     def dark_tiles(self) -> int:
-        """Number of tiles with splats that products skip because the loss has neither slope nor curvature there."""
+        """Number of tiles with splats where the loss has no slope and no pixelwise curvature: backward passes may skip them."""
         return self._raster.dark_tiles(self._adjoint, self._loss.diagonal)
 
     @property
@@ -218,8 +218,8 @@ class KeptViews:
     """A sequence of linearized views: the first `kept` that are used stay in memory, others are linearized at each use.
 
     linearize: makes the view of an index.  count: number of views.  memory: bytes for kept views and the workspace of a product
-    with VECTORS vectors; it decides `kept`, and no result.  `first`, the first view, is made at once and always kept; its size
-    is taken for that of every view.
+    with VECTORS vectors; it decides `kept`; results do not depend on it.  `first`, the first view, is made at once and always
+    kept; its size is taken for that of every view.
     """
 
     def __init__(self, linearize: Callable[[int], LinearizedView], count: int, memory: int):

@@ -5,7 +5,8 @@ mean in the splat's whitened coordinates (u, v) (`projection/whitening.py`), opa
 the splat:
 
     l = log2 alpha = log2 o - u^2 - v^2      alpha = min(cap, 2^l)
-    active where l >= cut (from alpha_min and contour) and the pixel has not stopped; else alpha = 0, and no update below acts
+    active where l >= cut (from alpha_min and contour) and the pixel has not stopped; else alpha = 0, and no update below acts.
+    It stops in front of the splat that would bring T below floor.
 
 `forward`           w = alpha T;  image += w c;  T <- T - w;  at the end image += T background, alpha plane = 1 - T.
 
@@ -13,15 +14,17 @@ the splat:
                     and R, the sum over the splats behind of w_j (v_image . c_j) plus the background's part, at
                     T (v_image . background - v_alpha):
                     r = 1 / (1 - alpha);  T <- T r;  w = alpha T;  beta = alpha r;  e = v_image . c
-                    s = w e - beta R, the derivative in q = ln alpha, 0 where the cap holds;  R <- R + w e
+                    s = w e - beta R, the derivative in q = ln alpha, 0 where 2^l > free;  R <- R + w e
                     per splat: moments S, Su, Sv, Suu, Suv, Svv of s over the offsets, and G = sum w v_image.
 
-`tangent`           (J u) given tangents of the splats; q' is one quadratic in the offset, 0 where the cap holds:
-                    w' = w q' + alpha T';  image' += w' c + w c';  T' <- T' - w';  at the end image' += T' background.
+`tangent`           (J u) given tangents of the splats; q' is one quadratic in the offset, 0 where 2^l > free (`Thresholds`):
+                    w' = w q' + alpha T';  image' += w' c + w c';  T' <- T' - w';  at the end image' += T' background, and the
+                    alpha plane' = -T'.
 
 `backward_tangent`  given q', c' and v_image'.  With tau = T' / T, r, w, beta, R as above:
+                    behind all splats R' = (T (v_image . background - v_alpha))'
                     tau <- tau + beta q';  nu = q' + tau;  h = nu v_image + v_image';  z = w (h . c + v_image . c')
-                    s' = z - beta (R' + r R q'), 0 where the cap holds;  R' <- R' + z;  moments of s' and G' = sum w h.
+                    s' = z - beta (R' + r R q'), 0 where 2^l > free;  R' <- R' + z;  moments of s' and G' = sum w h.
 """
 
 from math import ceil, floor, inf, log, log2, sqrt
@@ -38,8 +41,8 @@ from splat.projection.whitening import Q0, QU, QUU, QUV, QV, QVV, ROUND
 SPLAT = 9  # numbers of a splat, of its tangent (six coefficients of q', colour'), and of its adjoint (six moments, G)
 WIDEN = 1e-4  # relative widening of an ellipse's level, so that no active pixel is missed
 
-# The sums that make a splat's diagonal block (`cpu/blocks.py`): moments of s + v to degree 4; from CROSS, for each channel c,
-# moments of w g_c + w h_c D_c to degree 2; from COLOUR, for each channel, the sum of w^2 h_c.
+# The sums that make a splat's diagonal block (`render/cpu/blocks.py`): moments of its q q term to degree 4; from CROSS, for
+# each channel c, moments of w g_c + w h_c D_c to degree 2; from COLOUR, for each channel, the sum of w^2 h_c.
 DEGREE4, DEGREE2 = 15, 6  # numbers of moments u^j v^k with j + k at most 4, and at most 2
 CROSS, COLOUR = DEGREE4, DEGREE4 + 3 * DEGREE2
 BLOCK_SUMS = COLOUR + 3
@@ -177,10 +180,10 @@ def column_terms(columns, u):
 
 @formula
 def second_order(q, moments, total):
-    """Tangent of a splat's six moments along the coefficients q.
+    """Tangent of a splat's adjoint along the coefficients q, as six moments at the whitening W and opacity o before.
 
-    moments: of s; total: moments of s' at fixed offsets.  The other terms are due to the offsets, which are relative to the
-    splat and change as it moves.
+    moments: of s; total: moments of s' at fixed offsets.  The other terms: offsets move with the mean, whose gradient is
+    sum s Q d; that of o is S / o.
     """
     S, Su, Sv = moments[0], moments[1], moments[2]
     u, v = q[QU] / ROUND, q[QV] / ROUND
@@ -308,7 +311,7 @@ def colour_slopes(free, beta, R, colour):
 
 @formula
 def step_block(w, free, beta, R, g, h, colour):
-    """D (three channels), the colour R in front of the splat, and s + v of `cpu/blocks.py`; g, h: of the image's loss."""
+    """D (three channels), the colour R seen from in front of the splat, and its q q term; g, h: of the image's loss."""
     D = colour_slopes(free, beta, R, colour)
     weight = D[0] * (g[0] + h[0] * D[0]) + D[1] * (g[1] + h[1] * D[1]) + D[2] * (g[2] + h[2] * D[2])
     return D, plus(R, w, colour), weight

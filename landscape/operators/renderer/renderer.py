@@ -19,7 +19,8 @@ smaller one elsewhere: the jump lies on the other side.
 **The step h.**  |.| is the root mean square, dI the image's change in a step.  Rounding the image, by u = eps / 4 of its size
 on average, makes a relative error u |I| / |dI| in J v.  Jumps make differences one-sided in pixels whose share grows with the
 step, an error like |dI| / |I|.  The two are equal at |dI| = sqrt(u) |I|.  The noise of a renderer that does not repeat itself
-takes the place of u where it is larger.  TRIALS renders of the first view that v changes find h.
+takes the place of u where it is larger.  TRIALS renders find h, in the first view that v changes; each before it
+costs as many.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,7 +44,7 @@ TRIALS = 2  # renders that find a step
 FACTOR = 1e4  # the largest by which a trial changes h
 ROUNDING = 1 / 4  # mean error of a rounded number, in units of eps
 KEPT = 1 << 30  # bytes for J^T g of the first views; each other view costs one backward pass more in a product
-SEEN = 3  # times the noise: a smaller change of an image may be noise: two renders differ by sqrt(2) of it
+SEEN = 3  # times the noise: a smaller change of an image may be noise, by sqrt(2) of which two renders differ
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -231,7 +232,7 @@ class RendererHessian:
     def products(
         self, V: Float[Tensor, "n k"], factor: float = 1.0
     ) -> tuple[Float[Tensor, "n k"], Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-        """H V, the share of |J v|^2 in kinked pixels, and the steps h: `factor` times those of `step`, 0 where none sees v."""
+        """H V, the share of |J v|^2 in kinked pixels, and the steps h: `factor` times those of `step`, 0 if no view sees v."""
         total, kinks = torch.zeros_like(V), torch.zeros(2, V.shape[1], dtype=torch.float64)
         steps = [0.0] * V.shape[1]
         with self.at_point():
@@ -261,7 +262,7 @@ class RendererHessian:
             yield
 
     def step(self, index: int, view: LinearView, v: Tensor) -> float:
-        """The step h along v; 0 where the image changes by no more than its noise."""
+        """The step h along v; 0 where the image changes by no more than SEEN times its noise."""
         largest, size, seen = float(v.abs().max()), rms(view.image) or 1.0, False
         noise = SEEN * self.noise * size
         # at first the largest entry of h v is `change` times the largest parameter

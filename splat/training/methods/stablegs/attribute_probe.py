@@ -4,10 +4,10 @@
             sphere, without radial directions, since H_quats scales with 1 / |q|^2
     rho     c / (tau + eps), at most the attribute's cap                                                       Eq. (5)
     rise    of the quadratic model under a random probe, 1/2 E[step H step] = rho^2 tr(H) / 2 = c^2 dim / 2: by the constants
-            alone, whatever the scene; for quats with rho per radian a quarter of it.  Where `dose` is "equal", every
-            attribute's c is the one whose rise is the mean of these.  Not in it: the slope along which means and opacities
+            alone, below the caps and for tr H > 0; for quats with rho per radian a quarter of it.  Where `dose` is "equal",
+            each c is reset so that all rises equal their mean.  Not in it: the slope along which means and opacities
             step, the kinks of an l1 loss, the weights of SH bands and the shares of rotations
-    g       the gradient of the sampled view's loss
+    g       the gradient of the sampled view's loss, its regularisers included
     v       the unit vector from that view's camera centre to the mean
     means   + rho u,  u the direction of gamma g_depth + (1 - gamma) g_lateral,  g_depth = (g.v) v             Eqs. (7), (8)
     quats   q x exp(omega), omega ~ N(0, rho_i^2 1), rho_i = rho min((kappa - 1) / kappa_full, 1), in radians  Eqs. (9), (10)
@@ -16,9 +16,9 @@
     sh      + w_l e, e ~ N(0, 1) for each coefficient and channel, w_l = rho (1 + l / l_max), rho if l_max = 0 Eq. (13)
 
 Quaternions are w x y z; x is the Hamilton product, exp(omega) = (cos(|omega| / 2), sin(|omega| / 2) omega / |omega|).  kappa is
-the condition number of the splat's covariance in the sampled view, with its blur.  A Gaussian outside the view has g = 0 and no
-kappa: its mean, quaternion and opacity stay.  Scales and SH of all Gaussians are probed, as in Eqs. (11) and (13), for renders
-of the probed copy from other poses.
+the condition number of the splat's covariance in the sampled view, with its blur.  A Gaussian outside the view has no kappa
+and, but for a regulariser of opacities, g = 0: its mean, quaternion and opacity stay.  Scales and SH of all Gaussians are
+probed, as in Eqs. (11) and (13), for renders of the probed copy from other poses.
 
 The step counts as a constant, as in SAM: with Theta' = Theta + step (Eq. (14)), dTheta' / dTheta is the identity, except for
 quaternions: there it is right multiplication by exp(omega), an orthogonal matrix.
@@ -80,7 +80,7 @@ class ProbeSettings(Settings):
     """Settings of the probes: c and eps of Eq. (5), caps of rho, gamma of Eq. (8), kappa_full of Eq. (10).
 
     attributes: those that are probed, if their c is above 0.  dimension: dim of tau (`splat.curvature.traces.curvature_scale`);
-    by default not "active", with which rho is larger by the root of the number of Gaussians, and at its cap in all but tiny
+    default "attribute": with "active" rho is larger by the root of the number of Gaussians, and at its cap in all but tiny
     scenes.  gamma: 1 for steps of means along the viewing ray, 0.5 along the gradient itself.  dose: each attribute's own c, or
     an equal rise.  rotation_unit: of c / (tau + eps) for quats; the cap is in radians in either.
     """
