@@ -26,8 +26,8 @@ class ProbeOptions:
     strict: bool = False
     """Exit with 1 if a self-check fails."""
     quick: bool = False
-    """Numbers to 10%, in about half the time, into probe-quick; without density, indices that need it, power iteration,
-    depth, and the slice's plane."""
+    """Numbers to 10%, in a quarter to half of the time, into probe-quick; without density, indices that need it, power
+    iteration, depth, and the slice's plane."""
     density_products: int | None = None
     """Of the spectral density; more narrow the brackets of sums.  Default: 108."""
     end_products: int | None = None

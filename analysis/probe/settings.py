@@ -55,7 +55,7 @@ class ProbeSettings:
 
     @classmethod
     def quick(cls) -> "ProbeSettings":
-        """Numbers to 10%, in about half the time."""
+        """Numbers to 10%, in a quarter to half of the time."""
         return cls(
             checked_vectors=2,
             checked_views=1,
