@@ -121,7 +121,7 @@ UNIT, MEAN = "× the optimiser's step", "the mean of back and forth (by its curv
     ],
 )
 def test_only_what_renders_bear_out_is_said_of_a_curvature(curvature, ratios, confirmed, said):
-    errors = [0.0 if confirmed is not None else 3.0] * 3
+    errors: list[float | None] = [0.0 if confirmed is not None else 3.0] * 3
     renders = Renders(confirmed=confirmed, low=0.05, high=0.1, steps=[0.05, 0.1, 0.2], ratios=ratios, errors=errors)
     end = End("e", "an end", torch.zeros(1), curvature, msgspec.structs.replace(renders, optimiser_step=0.1))
     step = shown_step(renders)
