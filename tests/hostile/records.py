@@ -5,7 +5,6 @@ import json
 from functools import cache
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -82,11 +81,7 @@ def _use_probes(root: Path, chance: Random) -> Read:
         frame(rows, ["a", "b"]).to_csv(index=False)
         console.print(compare_table(rows, ["a", "b"]))
     render_page(runs, groups_of([Path("a"), Path("b")]), rows, [], cautions(runs), root)
-    if chance.random() < 5 * DRAWN:
-        report.render_report(record)
-    else:  # without the surface, whose program takes the longest to pack
-        with patch.object(report, "interactive_surface", return_value=None):
-            report.render_report(record)
+    report.render_report(record)
     _draw(record, chance)
     return [array for arrays in record.arrays.values() for array in arrays.values()]
 
@@ -140,8 +135,7 @@ def _write_map(root: Path) -> None:
 
 
 def _use_map(root: Path, chance: Random) -> Read:
-    with patch.object(report, "interactive_surface", return_value=None):
-        text = report.render_report(read_record(root / "probe"))
+    text = report.render_report(read_record(root / "probe"))
     assert text.rstrip().endswith("</html>") and "photograph" in text, "a page without its own pictures"
     return None
 
