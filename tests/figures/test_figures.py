@@ -7,6 +7,7 @@ import sys
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.axes._secondary_axes import SecondaryAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -19,7 +20,7 @@ from analysis.console.drawing import own_python
 from analysis.records.quantities import exponent_of
 from analysis.records.records import read_record
 from analysis.records.run_files import END_MAPS, Steepest
-from figures import make_all, maps, slice2d, spectrum, surface, traces
+from figures import make_all, maps, slice2d, spectrum, surface, traces, uses
 from figures.plane import plane
 from figures.style import BLACK, BLUE, COLUMN, ORANGE, SKY, VERMILION, save, style
 from landscape.errors import TooLittleMemory
@@ -206,6 +207,16 @@ def test_the_numbers_along_the_steps_stay_apart(tmp_path, reach):
             inside = [box for box in boxes if axes.bbox.x0 - 1 <= (box.x0 + box.x1) / 2 <= axes.bbox.x1 + 1]
             assert len(inside) >= 3
             assert all(right.x0 - left.x1 > 4 * POINT * figure.dpi for left, right in pairwise(inside))
+
+
+@pytest.mark.parametrize(("error", "said"), [(1.0, "One candidate is better"), (30.0, "4 of 9 candidates are equal")])
+def test_the_gains_of_candidates_fit_their_figure_whatever_their_names(error, said):
+    places = np.arange(9.0)
+    table = pd.DataFrame({"view": [f"images/{'DSC_20190401_123456_HDR_' * (i % 3)}{i}.png" for i in range(9)]})
+    table = table.assign(behind=20 * places, error=error * (places > 0), pick=np.where(places > 0, np.nan, 1.0))
+    figure = uses.draw_gains(table.assign(coverage=-places, farthest=-places, uniform=-places))
+    require_layout(figure)
+    assert figure.get_suptitle().startswith(said)
 
 
 def test_the_first_direction_runs_to_the_right(tmp_path):
