@@ -109,7 +109,9 @@ def test_kinks_are_told_once_where_they_explain(confirmed):
     end["renders"] = rendered | {"confirmed": confirmed} | ({"low": 2e-3, "high": 2e-3} if confirmed else {})
     line = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))["steepest"]
     beside = "(800 over the optimiser's step in renders; kinks of L1 add about 670 at short steps; one training)"
-    because = "(800 over the optimiser's step in renders; one training); not confirmed by renders, as kinks of L1, which"
+    because = (
+        "(800 over the optimiser's step in renders; one training); not confirmed by renders, as kinks of L1, which"
+    )
     assert line.count("kinks") == 1 and (beside if confirmed else because) in line
 
 
