@@ -7,7 +7,7 @@ evaluated   a point that is a true render; the others are interpolated, or unkno
 crossed     a render whose order of splats or set of visible ones is not the centre's: the loss may jump on the way there
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from analysis.records import schema
-from analysis.records.findings import unresolved, what_renders_say
-from analysis.records.quantities import exponent_of, rough, unit_suffix
-from analysis.records.records import ProbeRecord, Record
+from analysis.records.findings import unresolved
+from analysis.records.quantities import exponent_of, unit_suffix
+from analysis.records.records import Record
 from figures.style import literal
 from landscape.errors import InputError
 
@@ -27,10 +27,7 @@ TRUE_PROPORTIONS = 2.5  # ranges whose ratio is below this are drawn to the same
 
 @dataclass(frozen=True)
 class Direction:
-    """One axis of the slice; `exponent` is the power of ten taken out of its labels, `scale` what a step of 1 is.
-
-    rendered: of a probe's e₁, over which steps renders agree, in the words of the report.
-    """
+    """One axis of the slice; `exponent` is the power of ten taken out of its labels, `scale` what a step of 1 is."""
 
     name: str
     curvature: float
@@ -39,7 +36,6 @@ class Direction:
     exponent: int
     scale: str = "units of the parameters"
     kind: str = ""
-    rendered: str = ""
 
     @property
     def label(self) -> str:
@@ -131,7 +127,6 @@ def plane(record: Record) -> Plane:
         direction(d, steps, common if _alike(arrays) else exponent_of(steps))
         for d, steps in zip(about.directions, (arrays["x"], arrays["y"]), strict=True)
     ]
-    directions[0] = replace(directions[0], rendered=_rendered(record, directions[0]))
     return Plane(
         *directions,
         change=masked[0],
@@ -150,16 +145,6 @@ def direction(about: schema.Direction, steps: np.ndarray, exponent: int) -> Dire
     curvature, unit = (np.nan if number is None else number for number in (about.curvature, about.unit))
     scale = about.scale or Direction.scale
     return Direction(literal(about.name), curvature, unit, steps, exponent, literal(scale), about.kind or "")
-
-
-def _rendered(record: Record, first: Direction) -> str:
-    """Over which steps renders agree along e₁, and how many of the optimiser's are drawn; empty where they do not, or no more
-    is known."""
-    renders = record.data.eigenvalues.max.renders if isinstance(record.data, ProbeRecord) else None
-    if not (renders and renders.confirmed and renders.optimiser_step):
-        return ""
-    reach = rough(float(np.abs(first.steps).max()) / renders.optimiser_step)
-    return f"{what_renders_say(first.curvature, renders)} (drawn: to {reach} ×)"
 
 
 def _alike(arrays: dict[str, np.ndarray]) -> bool:

@@ -1,10 +1,9 @@
 """Figure: the two cross-sections of a slice, each under what it found, and the plane between them.
 
 Sections: the loss, from true renders; blue dots where the order of the splats or the set of visible ones is not the centre's,
-if it is so at some only; dashed: the quadratic model.  Their titles say how far renders agree (of a probe's e₁ in the words of
-its report), or compare second differences of the loss with the model's.  They share their vertical axis, so that a steep
-direction looks steep beside a flat one; their upper axes count steps in curvature units: steps within which the curvature
-alone changes the loss by the amount named.
+if it is so at some only; dashed: the quadratic model.  Their titles compare second differences of the loss with the model's.
+They share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes count steps in
+curvature units, as the titles do: steps within which the curvature alone changes the loss by the amount named, ΔL.
 
 Plane: three contours of the loss and, dashed, of the model at the same levels, those of the colour bar's ticks; grey dots:
 renders; grey: no finite loss; crosses: the checkpoint (upright), and where the plane leads.  Where too few points are renders
@@ -64,13 +63,10 @@ def draw(record: Record) -> Figure:
 
 
 def finding(direction: Direction, change: np.ndarray, model: np.ndarray | None) -> str:
-    """Sentence: how far renders agree with the curvature; where a probe does not say it, how the loss curves from the centre to
-    each step of the section, beside what the curvature says.
+    """Sentence: how the loss curves from the centre to each step of the section, beside what the curvature says.
 
     Of the second differences: a slope cancels in them.
     """
-    if direction.rendered:
-        return f"Along {direction.name} {direction.rendered}"
     along = f"Along {direction.name} the loss"
     centre = direction.centre
     steps = np.arange(1, min(centre, len(change) - 1 - centre) + 1)
@@ -141,7 +137,7 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.grid(True)
     axes.set_title(textwrap.fill(finding(direction, line, model), HALF), loc="left")
-    direction.count_units(axes, INTERVALS, "steps in curvature units")
+    direction.count_units(axes, INTERVALS, f"steps in curvature units,\n1: ΔL = {quantity(field.loss_scale)}")
 
 
 def _crossed(field: Plane, axis: int) -> np.ndarray:
@@ -164,12 +160,11 @@ def _legend(field: Plane) -> list[Line2D]:
         size = "unbounded" if field.error is None else f"<{rough(100 * field.error)}%"
         words = f"plane: {field.evaluated.mean():.0%} rendered,\nelse interpolated (error {size})"
         handles.append(Line2D([], [], label=words, **{**FAINT, "markersize": 4}))
+    if field.model is not None:
+        handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
     if field.crossed is not None and field.crossed.any():
         words = f"order changed: {field.crossed.sum():,}\nof {field.evaluated.sum():,} renders"
         marked = any(_crossed(field, axis).any() for axis in (0, 1))
         look: dict[str, Any] = {**CROSSED, "markersize": 6} if marked else {"linestyle": "none"}
         handles.append(Line2D([], [], label=words, **look))
-    if field.model is not None:
-        handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
-    handles.append(Line2D([], [], linestyle="none", label=f"1 curvature unit:\nΔL = {quantity(field.loss_scale)}"))
     return handles

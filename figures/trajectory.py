@@ -1,7 +1,8 @@
 """Figure: the landscape along one or several trainings, from the table that `landscape trajectory` wrote.
 
 `python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Every panel has a logarithmic axis of magnitudes,
-hollow where the number is negative; a number is left off that is 0 within round-off of the panel's largest.  A method has one
+hollow where the number is negative, and the same steps; what is left off, as it is 0 within round-off of the panel's largest,
+the legend says.  A method has one
 colour, its trainings differ by their lines.  The title says what became of the steepest curvature of each method.
 """
 
@@ -38,7 +39,7 @@ UNITS = (
 )
 NEGATIVE, LINES = "−λ min", ("-", "--", ":", "-.")  # title where all are negative; of the trainings of a method
 ROUND_OFF = float(np.finfo(np.float32).eps)
-PANEL = 1.12  # inches of height
+PANEL, ROOM = 1.12, 0.08  # inches of height; of the steps, beside them
 LEGEND_LINE, WRAP = 0.14, 58
 ARROW: dict[str, Any] = {"marker": r"$\uparrow$", "markersize": 7, "linestyle": "none"}  # stands on a lower bound
 
@@ -51,6 +52,11 @@ def draw(table: pd.DataFrame) -> Figure:
     measured = with_ends(pd.DataFrame(table[table["state"] != "skipped"]))
     if measured["lambda_max"].dropna().empty:
         raise InputError("expected at least one record that was not skipped, got none")
+    if negative := not (np.asarray(measured["lambda_min"], dtype=float) >= 0).any():
+        low, at, high = (-measured[f"lambda_min{end}"] for end in ("_high", "", "_low"))
+        measured = measured.assign(lambda_min_low=low, lambda_min=at, lambda_min_high=high)
+    first, last = (float(end(measured["step"].to_numpy(float))) for end in (np.min, np.max))
+    room = ROOM * (last - first) or 1.0
     methods: dict[str, list[str]] = {}
     for name in map(str, table["run"].unique()):
         methods.setdefault(name.rpartition("/")[0] or name, []).append(name)
@@ -62,9 +68,9 @@ def draw(table: pd.DataFrame) -> Figure:
     with style():
         figure = new_figure(PANEL * 3 + LEGEND_LINE * (len(methods) + len(runs) + 6))
         for axes, (name, title) in zip(figure.subplots(3, 2).flat, PANELS.items(), strict=True):
-            negative = name == "lambda_min" and not (np.asarray(measured[name], dtype=float) >= 0).any()
-            axes.set_title(NEGATIVE if negative else literal(title))
+            axes.set_title(NEGATIVE if negative and name == "lambda_min" else literal(title))
             over_steps(axes, measured, runs, name)
+            axes.set_xlim(first - room, last + room)
             axes.grid(True)
             axes.xaxis.set_major_locator(step_ticks())
             if not any(np.isfinite(line.get_ydata()).any() for line in axes.lines):
@@ -112,7 +118,7 @@ def over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, dict[str, Any
     Hollow where it is negative.  Of one with only a lower bound an arrow stands on that, without a line; without one, nothing.
     """
     axes.set_yscale("log")
-    axes.margins(0.08, 0.12)
+    axes.margins(ROOM, 0.12)
     least = ROUND_OFF * measured[name].abs().max()
     for run, look_of in runs.items():
         colour = look_of["color"]
@@ -135,14 +141,17 @@ def over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, dict[str, Any
 
 
 def marker_words(measured: pd.DataFrame, *names: str) -> list[Line2D]:
-    """Legend of hollow markers and triangles, where one of the indices has any."""
+    """Legend of hollow markers, arrows and what is left off, where one of the indices has any."""
     values = measured[list(names)].to_numpy(float)
     ends = np.stack([measured[[f"{name}{end}" for name in names]].to_numpy(float) for end in ("_low", "_high")])
     bounds = np.isfinite(values) & ~np.isfinite(ends).all(axis=0)
     look: dict[str, Any] = {"color": BLACK, "markersize": 3, "linestyle": "none"}
     hollow = Line2D([], [], marker="o", markerfacecolor="white", label="open: the number is negative", **look)
     arrow = Line2D([], [], color=BLACK, label="arrow: at least so large", **ARROW)
-    return [hollow] * bool((values < 0).any()) + [arrow] * bool(bounds.any())
+    tiny = abs(values) <= ROUND_OFF * np.nanmax(abs(values), axis=0, initial=0)
+    left_off = Line2D([], [], linestyle="none", label="left off: 0 within round-off")
+    shown = (hollow, ((values < 0) & ~tiny).any()), (arrow, bounds.any()), (left_off, tiny.any())
+    return [handle for handle, there in shown if there]
 
 
 def draw_named(path: Path) -> list[tuple[str, Figure]]:

@@ -1,5 +1,6 @@
 """Pictures of `landscape prune`, `next-view` and `uncertainty`: `python -m figures.uses RUN/prune`"""
 
+import textwrap
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from analysis.commands.uses.options import GEOMETRY, TWICE
 from analysis.console.failures import program
@@ -39,6 +41,7 @@ SCORES = {
     "size_opacity": ("size x opacity", PURPLE),
 }
 MEASURES = {"train_psnr": "training views, PSNR (dB)", "test_psnr": "held-out views, PSNR (dB)"}
+WRAP, HALF = 54, 26  # characters in a line of the figure, and in half of one
 
 
 def _rows(table: pd.DataFrame, **known: str | bool) -> Any:
@@ -69,24 +72,26 @@ def draw_curve(curve: pd.DataFrame) -> Figure:
 
 def draw_gains(table: pd.DataFrame) -> Figure:
     """How far every candidate is behind the best, with twice its error, the picks first; the best by other rules are named."""
-    best, rows, reach = (
-        {rule: np.nanargmax(table[rule].to_numpy(float)) for rule in GEOMETRY},
-        range(len(table)),
-        TWICE * table["error"],
-    )
+    best, reach = {rule: np.nanargmax(table[rule].to_numpy(float)) for rule in GEOMETRY}, TWICE * table["error"]
+    labels = []
+    for place, (view, pick) in enumerate(zip(table["view"].tolist(), table["pick"].tolist(), strict=True)):
+        named = [f"pick {pick:.0f}"] * (float(pick) > 0) + [rule for rule, at in best.items() if at == place]
+        words = f"{Path(str(view)).name} ({', '.join(named)})" if named else Path(str(view)).name
+        labels.append(literal(textwrap.fill(words, HALF)))
+    lines = np.array([1 + label.count("\n") for label in labels])
+    rows, equal = lines.cumsum() - lines / 2, int(np.sum(table["behind"] <= reach))
+    said = f"{equal} of {len(table)} candidates are equal within twice their error"
     with style():
-        figure = new_figure(0.9 + 0.16 * len(table))
+        figure = new_figure(1.0 + 0.16 * lines.sum())
         axes = figure.subplots()
         axes.errorbar(-table["behind"], rows, xerr=reach, fmt="o", color=BLUE, markersize=3, linewidth=0.8)
-        labels = []
-        for place, (view, pick) in enumerate(zip(table["view"].tolist(), table["pick"].tolist(), strict=True)):
-            named = [rule for rule, at in best.items() if at == place]
-            words = ", ".join([*([f"pick {pick:.0f}"] if float(pick) > 0 else []), *named])
-            labels.append(literal(Path(str(view)).name + (f"  ({words})" if words else "")))
         axes.set_yticks(rows, labels)
         axes.invert_yaxis()
-        axes.set(xlabel="gain less that of the best, ± twice the error of the difference")
-        axes.set_title(f"{(table['behind'] <= reach).sum()} of {len(table)} candidates are equal within their errors")
+        axes.xaxis.set_major_locator(MaxNLocator(3))
+        words = "gain less that of the best, ± twice the error of the difference"
+        figure.supxlabel(textwrap.fill(words, WRAP), fontsize=7)
+        one = "One candidate is better than all others by more than twice the error"
+        figure.suptitle(textwrap.fill(said if equal > 1 else one, WRAP), fontsize=7.5)
         axes.grid(visible=True)
     return figure
 

@@ -1,8 +1,10 @@
 """The pages in a real browser: the report and `landscape view`, driven as a user drives them."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,11 +16,16 @@ from analysis.commands.map.fields import measured_fields
 from analysis.commands.map.pictures import rendered
 from analysis.commands.view import viewer as view
 from analysis.commands.view.page import offline_page
+from analysis.runs.compare import render_page
+from analysis.runs.compare_table import Run, comparison
+from analysis.runs.seeds import Group, grouped
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.training.origin.fingerprint import Fingerprint
+from splat.training.state import TrainConfig
 from tests.analysis.records.test_report import carried, with_views
 from tests.browser import chromium, errors_in, requests_of, until
+from tests.recorded import probe_of, synthetic
 from tests.waiting import PATIENCE
 
 NOTHING = Fingerprint({}, {}, "")
@@ -45,9 +52,25 @@ def test_the_report_draws_moves_and_asks_for_nothing(browser, tmp_path):
     assert errors_in(browser) == [] and requests_of(browser) == [path.as_uri()]
 
 
+def page_of_a_comparison(folder: Path) -> Path:
+    """The page of two runs with long names and a picture."""
+    data = probe_of(synthetic()[0])
+    data.provenance.command = f"landscape probe {'folder/' * 40}checkpoint.pt"
+    checkpoint: Any = SimpleNamespace(training=SimpleNamespace(config=TrainConfig(), step=4))
+    runs = [Run(Path(name), name, checkpoint, None, data) for name in ("the_first_of_the_runs/" * 3, "other")]
+    groups = [Group(run.label, (run.folder,)) for run in runs]
+    folder.mkdir()
+    Image.new("RGB", (2000, 900), "white").save(folder / "compare_traces.png")
+    path = folder / "compare.html"
+    path.write_text(render_page(runs, groups, grouped(comparison(runs), groups), ["it says"], [], folder), "utf-8")
+    return path
+
+
 @pytest.mark.parametrize("width", [420, 1280])
-def test_nothing_of_the_page_is_cut_or_scrolls_sideways(browser, tmp_path, width):
-    path = with_views(tmp_path / "probe", ["a.png", "b.png"], carried("a.png"))
+@pytest.mark.parametrize("compared", [False, True])
+def test_nothing_of_the_pages_is_cut_or_scrolls_sideways(browser, tmp_path, width, compared):
+    several = partial(with_views, names=["a.png", "b.png"], data=carried("a.png"))
+    path = (page_of_a_comparison if compared else several)(tmp_path / "probe")
     screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     browser.get(path.as_uri())
@@ -55,6 +78,13 @@ def test_nothing_of_the_page_is_cut_or_scrolls_sideways(browser, tmp_path, width
     beyond = "[...document.body.querySelectorAll('*')].filter(each => !each.closest('.scroll, svg')"
     beyond += " && each.getBoundingClientRect().right > innerWidth + 1).map(each => each.outerHTML.slice(0, 80))"
     assert browser.execute_script(f"return [document.documentElement.scrollWidth <= {width}, {beyond}]") == [True, []]
+    if compared:  # a tap makes the picture as large as on a wide screen, and the page stays as wide as it was
+        browser.find_element("css selector", "figure img").click()
+        shown = "document.images[0].getBoundingClientRect().width"
+        size = browser.execute_script(f"return [{shown} > 1000, document.documentElement.scrollWidth <= {width}]")
+        assert (
+            size == [True, True] and browser.execute_script("return document.querySelectorAll('.scroll').length") == 1
+        )
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 

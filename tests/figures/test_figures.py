@@ -7,6 +7,7 @@ import sys
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.axes._secondary_axes import SecondaryAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -16,10 +17,10 @@ from msgspec import convert
 from PIL import Image
 
 from analysis.console.drawing import own_python
-from analysis.records.quantities import exponent_of
+from analysis.records.quantities import exponent_of, quantity
 from analysis.records.records import read_record
 from analysis.records.run_files import END_MAPS, Steepest
-from figures import make_all, maps, slice2d, spectrum, surface, traces
+from figures import make_all, maps, slice2d, spectrum, surface, traces, uses
 from figures.plane import plane
 from figures.style import BLACK, BLUE, COLUMN, ORANGE, SKY, VERMILION, save, style
 from landscape.errors import TooLittleMemory
@@ -208,6 +209,16 @@ def test_the_numbers_along_the_steps_stay_apart(tmp_path, reach):
             assert all(right.x0 - left.x1 > 4 * POINT * figure.dpi for left, right in pairwise(inside))
 
 
+@pytest.mark.parametrize(("error", "said"), [(1.0, "One candidate is better"), (30.0, "4 of 9 candidates are equal")])
+def test_the_gains_of_candidates_fit_their_figure_whatever_their_names(error, said):
+    places = np.arange(9.0)
+    table = pd.DataFrame({"view": [f"images/{'DSC_20190401_123456_HDR_' * (i % 3)}{i}.png" for i in range(9)]})
+    table = table.assign(behind=20 * places, error=error * (places > 0), pick=np.where(places > 0, np.nan, 1.0))
+    figure = uses.draw_gains(table.assign(coverage=-places, farthest=-places, uniform=-places))
+    require_layout(figure)
+    assert figure.get_suptitle().startswith(said)
+
+
 def test_the_first_direction_runs_to_the_right(tmp_path):
     data, arrays = synthetic()
     arrays["slice"]["loss"] = data["slice"]["center_loss"] + np.add.outer(np.arange(21.0), np.zeros(17))
@@ -311,13 +322,14 @@ def test_a_section_is_headed_by_how_far_its_curvature_holds(tmp_path, ratio, sai
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     titles = [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes]
     assert f"Along {data['slice']['directions'][0]['name']} the loss {said}" in titles
-    reach = float(arrays["slice"]["x"].max())
-    of = {"steps": [reach / 4], "ratios": [1.2], "errors": [0.1], "low": reach / 16, "high": reach, "confirmed": True}
-    data["eigenvalues"]["max"]["renders"] = of | {"optimiser_step": reach / 4}
-    figure = slice2d.draw(written(tmp_path / "rendered", data, arrays))
-    title = next(axes.get_title(loc="left") for axes in figure.axes if "Along e₁" in axes.get_title(loc="left"))
-    told = "renders agree within a factor of 2 at 1/4 to 4 × the optimiser's step (drawn: to 4.0 ×)"
-    assert title.replace("\n", " ") == f"Along e₁ {told}"
+    uppers = [
+        upper.get_xlabel() for axes in figure.axes for upper in axes.child_axes if isinstance(upper, SecondaryAxis)
+    ]
+    assert uppers == [f"steps in curvature units,\n1: ΔL = {quantity(data['slice']['loss_scale'])}"] * 2
+    assert all(
+        handle.get_marker() != "None" or handle.get_linestyle() != "None"
+        for handle in figure.subfigs[0].legends[0].get_lines()
+    )
     require_layout(figure)
 
 

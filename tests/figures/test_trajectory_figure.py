@@ -63,8 +63,8 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
         assert list(np.asarray(lines[0].get_xdata())) == [1000, 1500, 2000], name  # the skipped record is left out
         assert np.asarray(lines[0].get_ydata()) == pytest.approx([scale * abs(i - 2.5) for i in (2, 3, 4)])
     smallest = panels["−λ min"]
-    hollow = [x for x in smallest.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) == "#ffffff"]
-    assert [float(y) for x in hollow for y in np.asarray(x.get_ydata())] == pytest.approx(
+    filled = [x for x in smallest.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) != "#ffffff"]
+    assert [float(y) for x in filled for y in np.asarray(x.get_ydata())] == pytest.approx(
         [1 / 2, 1 / 3, 1 / 4, 3 / 2, 1, 3 / 4]
     )
     assert list(np.asarray(panels["Gaussians"].lines[0].get_ydata())) == [2000, 3000, 4000]
@@ -84,7 +84,10 @@ def test_trainings_of_a_method_share_its_colour_and_its_sentence(tmp_path):
 def test_a_number_that_is_0_within_round_off_is_left_off_the_logarithmic_axis():
     table = rows().assign(run="a")
     table.loc[1, ["trace_quats", "trace_quats_low", "trace_quats_high"]] = -7.7e-9
-    axes = {each.get_title(): each for each in trajectory.draw(table).axes}["trace of rotation"]
+    figure = trajectory.draw(table)
+    axes = {each.get_title(): each for each in figure.axes}["trace of rotation"]
+    assert "left off: 0 within round-off" in [text.get_text() for text in figure.legends[0].get_texts()]
+    assert {each.get_xlim() for each in figure.axes} == {(920.0, 2080.0)}
     (line,) = [x for x in axes.lines if x.get_linestyle() == "-"]
     assert np.isfinite(np.asarray(line.get_ydata(), float)).tolist() == [False, True, True]
     assert axes.get_ylim()[0] > 1e-3

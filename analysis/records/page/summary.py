@@ -95,14 +95,15 @@ def _end(end: Eigenvalue) -> str:
     if not end.is_reached:
         return f"{UNDETERMINED} (not reached)"
     value, renders = end.value or 0.0, end.renders
-    notes = [ONE]
+    notes, said = [ONE], what_renders_say(value, renders) if renders else "not rendered"
     if renders and renders.optimiser_step and (value > 0 or renders.confirmed):
         at = renders.at_step
-        over = "hidden by round-off" if at is None else rough(at * value)
-        kinks = f"; kinks of L1 add about {rough(renders.kinks)} at short steps" if renders.kinks else ""
-        notes.insert(0, f"{over} over the optimiser's step in renders{kinks}")
+        over = f"{'hidden by round-off' if at is None else rough(at * value)} over the optimiser's step in renders"
+        kinks = f"kinks of L1 add about {rough(renders.kinks)} at short steps" if renders.kinks else ""
+        beside = {"over the optimiser": over, "kinks": kinks}
+        notes = [note for told, note in beside.items() if note and told not in said] + notes
     text = f"{solved(value, end.residual)}{apart(end.views_error)} ({'; '.join(notes)})"
-    return f"{text}{_carrier(end)}; {what_renders_say(value, renders) if renders else 'not rendered'}"
+    return f"{text}{_carrier(end)}; {said}"
 
 
 def _carrier(end: Eigenvalue) -> str:
@@ -110,7 +111,7 @@ def _carrier(end: Eigenvalue) -> str:
     carrier = end.carrier
     if not carrier:
         return ""
-    random = f"(of a random direction {percent(carrier.random_share)})"
+    random = f"(a random direction has at most {percent(carrier.random_share)} on each)".replace("at most less", "less")
     if carrier.share < CARRIED:
         return f": over several Gaussians, at most {percent(carrier.share)} on one {random}"
     most = ", ".join(filter(None, (f"most of it in {SHORT[carrier.attribute]}", carrier.shape)))

@@ -90,7 +90,8 @@ def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, wide):
     over = "one training" if not confirmed else "330 over the optimiser's step in renders; one training"
     assert lines["negative"].startswith("−220 (" + over.replace("330", "−330"))
     who = (
-        "90% on Gaussian 3,739 (of a random direction 0.2%), most of it in rotation, a needle, 158 : 1 in the picture; "
+        "90% on Gaussian 3,739 (a random direction has at most 0.2% on each), most of it in rotation, a needle, 158 : 1 in "
+        "the picture; "
     )
     other = "each of the first 10 eigenvectors from this end lies on at most ten Gaussians"
     other = "number 4 from this end (−120) is the first eigenvector on more than ten Gaussians" if wide else other
@@ -98,6 +99,20 @@ def test_a_negative_end_is_what_renders_say_of_it(confirmed, ratio, said, wide):
     assert "λ max / λ min" not in str(lines)
     numbers = {name: index.value for name, index in probe_of(data).indices.items()}
     assert (numbers["negative_ratio"] is None) == (numbers["eigenvalue_ratio"] is None) == (confirmed is not True)
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_kinks_are_told_once_where_they_explain(confirmed):
+    data, _ = synthetic()
+    rendered = {"steps": [2e-3], "optimiser_step": 2e-3, "ratios": [4.0], "errors": [0.1], "kinks": 666.0}
+    end = data["eigenvalues"]["max"] = data["eigenvalues"]["max"] | {"value": 200.0, "reason": "tolerance"}
+    end["renders"] = rendered | {"confirmed": confirmed} | ({"low": 2e-3, "high": 2e-3} if confirmed else {})
+    line = dict(line.split(maxsplit=1) for line in map(soft, summary(probe_of(data), Path())))["steepest"]
+    beside = "(800 over the optimiser's step in renders; kinks of L1 add about 670 at short steps; one training)"
+    because = (
+        "(800 over the optimiser's step in renders; one training); not confirmed by renders, as kinks of L1, which"
+    )
+    assert line.count("kinks") == 1 and (beside if confirmed else because) in line
 
 
 @pytest.mark.parametrize(("low", "residual", "undecided"), [(-220.0, 3.0, False), (-2.0, 3.0, True), (5.0, 3.0, False)])
