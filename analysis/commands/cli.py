@@ -14,6 +14,7 @@ from contextlib import ExitStack, redirect_stderr
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import IO, Any, NoReturn
@@ -254,6 +255,9 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     require_seed(getattr(options, "seed", 0))
     _require_compiler()
     _require_there(options)
+    if isinstance(options, ViewOptions) and find_spec("viser") is None:
+        words = "expected the package viser, which shows a scene in the browser, got none; pip install -e '.[view]'"
+        raise InputError(words)
     name, function = command.runs.split(":")
     with ExitStack() as around:
         given = [options, ["landscape", *arguments]] if command.recorded else [options]

@@ -8,7 +8,6 @@ VALUE   a plain value, or text that is read by the setting's type: a number, tru
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -56,7 +55,7 @@ def _unknown(key: str, config: TrainConfig) -> str:
     words = f"expected a setting of the training or of the method {config.method.name}, got {key!r}"
     if of := [name for name, settings in others.items() if key in settings]:
         return f"{words}, which is one of --method {' and '.join(of)}"
-    return words + (did_you_mean(key, names) or f"; the nearest are {', '.join(get_close_matches(key, names, 3, 0.0))}")
+    return words + (did_you_mean(key, names) or f"; there are {', '.join(names)}")
 
 
 def _names(settings: TrainConfig | MethodSettings) -> list[str]:

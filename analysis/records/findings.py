@@ -247,7 +247,7 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
         lines.append(Line(unresolved(plane, made), "caution"))
     elif rendered < plane.points:
         text = f"Of the slice's {plane.points:,} points {rendered:,} are renders, among them all of both axes; the others are "
-        lines.append(Line(f"{text}interpolated{_to_tolerance(plane)} ({_errors_of_interpolation(plane)})."))
+        lines.append(Line(f"{text}interpolated, {_errors_of_interpolation(plane)}."))
     if plane.crossed_points:
         share = f"{plane.crossed_points:,} of the slice's {rendered:,} rendered points"
         text = f"At {share} the order of the splats or the set of visible ones is not the checkpoint's"
@@ -258,9 +258,11 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
 def _errors_of_interpolation(plane: schema.Slice) -> str:
     bound, count = plane.interpolation_error, plane.holdout_points
     seen = bound if plane.error_seen in (None, UNSET) else plane.error_seen
-    size = "without bound" if seen is None else f"at most {_percent(seen)}"
-    text = f"the error at {count} random point{'' if count == 1 else 's'}: {size}"
-    return text if bound is None else f"{text}; the bound for all: {_percent(bound)}"
+    at = f"at {count} random point{'' if count == 1 else 's'}"
+    if seen is None:
+        return f"{at} without bound"
+    everywhere = "" if bound is None else f", everywhere to {_percent(bound)}"
+    return f"{at} to {_percent(seen)}{everywhere} of the range of the loss"
 
 
 def unresolved(plane: schema.Slice, made: Provenance) -> str:

@@ -44,8 +44,7 @@ def run_trajectory(options: TrajectoryOptions) -> int:
         table.to_csv(partial, index=False, errors="backslashreplace")
     console.print(first_and_last(table))
     say(
-        "* renders confirm no end of these records, which the ratio rests on: landscape probe makes them",
-        console=console,
+        "* the ratio rests on eigenvalues that no renders have confirmed: landscape probe renders them", console=console
     )
     if len(versions := table.filter(["of_formulas"]).dropna().drop_duplicates()) > 1:
         say(f"records of {len(versions)} versions of the formulas do not compare: train again", style="yellow")
@@ -82,7 +81,7 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
         if not path.is_file():
             raise FileNotFoundError(
                 f"expected {RECORDS} in the run {run}, found none; train with --probe-every, as in "
-                f"landscape train SCENE --out {shlex.quote(str(run))} --probe-every 500"
+                f"landscape train SCENE --out {shlex.quote(f'{run}-along')} --probe-every 500"
             )
         table = read_trajectory(path)
         name = folder.name if folder == common else folder.relative_to(common).as_posix()

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
-from splat.model.files.read import is_foreign
+from splat.model.files.read import KINDS, is_foreign
 from splat.model.files.tensor_files import is_archive, loaded
 from splat.model.gaussians import Gaussians
 from splat.model.typed import MOST, Count, leaves, typed
@@ -195,6 +195,8 @@ def _read(file: BinaryIO, path: Path) -> Any:
         runs = [folder for folder in path.absolute().parents[:2] if (folder / FILE).is_file()]
         if runs and path.name != FILE and not is_archive(file):
             raise InputError(f"{KIND}, got {path}, another file of the run {runs[0]}; name that run") from error
+        if path.suffix.lower() not in (".pt", ".pth", ".ply") and not is_archive(file):
+            raise InputError(f"{KIND}, or a file of Gaussians ({KINDS}), got {path}, which is neither") from error
         ply = " (of other tools' files, probe, slice and convert read those)" if path.suffix.lower() == ".ply" else ""
         raise InputError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {error}; {REMEDY}") from error
 

@@ -148,7 +148,7 @@ def test_the_command_prints_first_and_last_values_and_writes_the_files(tmp_path,
     assert ["3dgs/0", "(1", "skipped)", "step", "1,000", "(whole)", "step", "2,000", "(whole)"] in lines
     assert ["largest", "eigenvalue", "2.00", "±", "0.10", "4.00", "±", "0.10"] in lines
     place = lines.index(["eigenvalue", "ratio*", "−4.00", "−16.0"]) + 1
-    assert said.count("* renders confirm no end of these records") == 1
+    assert said.count("* the ratio rests on eigenvalues that no renders have confirmed") == 1
     assert lines[place] == ["−4.40", "to", "−3.60", "−17.6", "to", "−14.4"]
     assert ["participation", "ratio", "≥", "10.0", "≥", "20.0"] in lines  # of which nothing else is certain
 
@@ -175,7 +175,7 @@ def test_a_run_without_records_or_named_twice_is_refused_with_what_to_do(tmp_pat
     rows()[:1].assign(note="no Gaussian touches a pixel").to_csv(tmp_path / "blind" / "trajectory.csv", index=False)
     (run(tmp_path / "empty") / "trajectory.csv").write_text("")
     for runs, told in (
-        ([kept, tmp_path / "bare"], "train with --probe-every"),
+        ([kept, tmp_path / "bare"], f"landscape train SCENE --out {tmp_path / 'bare-along'} --probe-every 500"),
         ([kept, kept], "every run once"),
         ([kept, tmp_path / "gone"], f"{tmp_path / 'gone'} does not exist"),
         ([tmp_path / "blind"], "got 1 skipped (no Gaussian touches a pixel)"),

@@ -30,7 +30,7 @@ STEEPEST = "e₁"
 
 def run_view(options: ViewOptions) -> int:
     """Show the checkpoint until Ctrl-C, or write a page; returns the exit code."""
-    viser = _viser()
+    viser = import_module("viser")
     require_known_field(options.shown, (APPEARANCE, *FIELDS, *ENDS))
     console, folder = Console(stderr=True), options.checkpoint.parent
     stages = Stages(console)
@@ -60,15 +60,6 @@ def run_view(options: ViewOptions) -> int:
     finally:
         server.stop()
     return 0
-
-
-def _viser() -> Any:
-    try:
-        return import_module("viser")
-    except ImportError as error:
-        raise InputError(
-            f"expected the package viser, which shows a scene in the browser, got none ({error}); pip install -e '.[view]'"
-        ) from None
 
 
 def _server(viser: Any, options: ViewOptions) -> Any:

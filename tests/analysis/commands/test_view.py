@@ -9,7 +9,7 @@ import torch
 from analysis.commands.cli import main
 from analysis.commands.map.fields import measured_fields
 from analysis.commands.map.pictures import rendered
-from analysis.commands.view import command, page
+from analysis.commands.view import page
 from analysis.commands.view import viewer as view
 from analysis.measures.steepest import heaviest_view
 from splat.curvature.objective import SceneObjective
@@ -35,11 +35,9 @@ def viewer(objective):
     server.stop()
 
 
-def test_without_viser_it_says_what_to_install(monkeypatch, capsys, tmp_path):
-    def missing(_: str):
-        raise ImportError("No module named 'viser'")
-
-    monkeypatch.setattr(command, "import_module", missing)
+def test_without_viser_it_says_what_to_install_before_libraries_are_loaded(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("analysis.commands.cli.find_spec", lambda name: None)
+    monkeypatch.setattr("analysis.commands.cli.import_module", lambda name: pytest.fail(f"{name} is loaded"))
     (tmp_path / "checkpoint.pt").touch()
     assert main(["view", str(tmp_path / "checkpoint.pt")]) == 2
     assert "pip install -e '.[view]'" in capsys.readouterr().err

@@ -144,11 +144,10 @@ def test_the_findings_say_how_much_of_the_slice_is_interpolated():
     data["slice"] |= {"error_seen": 0.002, "tolerance": 0.01}
     said = sentences(data)
     assert "Of the slice's 357 points 80 are renders" in said
-    assert "interpolated to 1.0% of the range of the loss" in said
-    assert "(the error at 30 random points: at most 0.20%; the bound for all: 0.40%)" in said
+    assert "interpolated, at 30 random points to 0.20%, everywhere to 0.40% of the range of the loss." in said
     assert "70 of the slice's 80 rendered points" in said
     data["slice"] |= {"interpolation_error": None, "error_seen": None}
-    assert "30 random points: without bound" in sentences(data)
+    assert "30 random points without bound" in sentences(data)
     data["slice"]["resolved"] = False
     assert "from 80 of 357 renders, and no surface is drawn; landscape slice" in sentences(data)
 

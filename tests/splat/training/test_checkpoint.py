@@ -101,6 +101,12 @@ def test_a_file_of_another_kind_is_refused_and_what_was_wrong_is_kept(tmp_path, 
     caught = refused(path, f"expected a checkpoint written by landscape train.*damaged{of}")
     why = caught.__cause__
     assert content == PLY or (why and isinstance(why.__cause__, zipfile.BadZipFile))
+    other = path.rename(tmp_path / "surface.png")
+    if content[:2] != b"PK":
+        assert (
+            "take another copy"
+            not in refused(other, r"or a file of Gaussians \(PLY, .*got .*surface.png, which is nei").args[0]
+        )
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO])
