@@ -20,7 +20,6 @@ The run folder appears at once, with its first checkpoint.
 """
 
 import os
-import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -234,26 +233,10 @@ def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
 
 def _asked(options: TrainOptions, scene: Scene | None) -> TrainConfig:
     """The settings as given: options over --set over the protocol's presets over defaults; scene: of the background."""
+    red, green, blue = scene.background.tolist() if scene else COLOURS["black"]
     if options.method not in METHODS:
         meant = did_you_mean(options.method, METHODS)
         raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}{meant}")
-    changes = assignments(options.set)
-    try:
-        return _overridden(options, scene, changes)
-    except InputError as error:
-        found = re.match(r"'([\w.]+)': expected (.+), got (.+)", str(error))
-        if found is None:
-            raise
-        name, what, got = found.groups()
-        option = next(
-            (f"--set {key}" for key in changes if f".{key}".endswith(f".{name}")), f"--{name.replace('_', '-')}"
-        )
-        words = re.sub("^int", "a whole number", re.sub("^float", "a number", what))
-        raise InputError(f"expected {words} for {option}, got {got}") from error
-
-
-def _overridden(options: TrainOptions, scene: Scene | None, changes: dict[str, str]) -> TrainConfig:
-    red, green, blue = scene.background.tolist() if scene else COLOURS["black"]
     config = TrainConfig(
         iterations=METHODS[options.method].ITERATIONS if options.iterations is None else options.iterations,
         seed=options.seed,
@@ -265,6 +248,7 @@ def _overridden(options: TrainOptions, scene: Scene | None, changes: dict[str, s
         method=METHODS[options.method](),
         protocol=options.protocol,
     )
+    changes = assignments(options.set)
     given = {key: name for key, name in OPTIONS.items() if getattr(options, name) != getattr(TrainOptions, name)}
     for key, name in given.items():
         if key in changes:
