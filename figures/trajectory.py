@@ -2,8 +2,8 @@
 
 `python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Every panel has a logarithmic axis of magnitudes,
 hollow where the number is negative, and the same steps; what is left off, as it is 0 within round-off of the panel's largest,
-the legend says.  A method has one
-colour, its trainings differ by their lines.  The title says what became of the steepest curvature of each method.
+the legend says.  A method has one colour, its trainings differ by their lines.  The title says what became of the steepest
+curvature of each method.
 """
 
 import textwrap

@@ -74,8 +74,7 @@ def _to_own(options: ConvertOptions) -> list[str]:
 def _to_tool(options: ConvertOptions, to: str) -> list[str]:
     found, seen = _foreign(options) if is_foreign(options.source) else own_file(load_checkpoint(options.source))
     extra: Mapping[str, np.ndarray] = found.extra
-    width = found.settings.get("resolution")
-    said = {"antialiased": found.antialiased, "train": found.train, "width": width if isinstance(width, int) else None}
+    said = {"antialiased": found.antialiased, "train": found.train, "width": found.width}
     if to == "graphdeco":
         gaussians = found.gaussians
         content = splat_ply(gaussians, extra, found.tool, **said)
@@ -153,5 +152,5 @@ def own_file(checkpoint: Checkpoint) -> tuple[SplatFile, Seen]:
     tool = next((name for name in OURS if seen.is_that_of(name, antialiased=antialiased)), None)
     notes = () if shift is None else (shift_in_words(shift),)
     width = max(width for width, _ in scene.sizes)
-    said = {"antialiased": antialiased, "train": tuple(scene.train), "notes": notes, "settings": {"resolution": width}}
+    said = {"antialiased": antialiased, "train": tuple(scene.train), "width": width, "notes": notes}
     return SplatFile(training.gaussians, OURS[0], tool, training.step, **said), seen

@@ -145,16 +145,14 @@ def what_renders_say(value: float, renders: schema.Renders) -> str:
     if renders.confirmed is None:
         return f"not resolved: round-off hides it in renders at up to {optimiser_steps(renders, renders.hidden)}"
     ratio, why = renders.at_step, ""
-    if renders.kinks > abs(value) and (ratio is None or ratio * value > value):
+    if renders.bent_by_kinks(value):
         why = f", as kinks of L1, which the eigenvalue leaves out, curve by {rough(renders.kinks)}"
     elif ratio is not None:
         why = f", by which it is {rough(ratio * value)} over the optimiser's step"
-    falls = (
-        ": they fall too, but not as it says, and no saddle is claimed"
-        if ratio and ratio > 0
-        else ": no saddle is claimed"
-    )
-    return f"not confirmed by renders{why}" + (falls if value < 0 else "")
+    if value >= 0:
+        return f"not confirmed by renders{why}"
+    falls = "they fall too, but not as it says, and " if ratio and ratio > 0 else ""
+    return f"not confirmed by renders{why}: {falls}no saddle is claimed"
 
 
 def _of_ends(data: ProbeRecord) -> list[Line]:

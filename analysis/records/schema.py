@@ -164,6 +164,11 @@ class Renders(Struct, kw_only=True):
         known = [(step, ratio, error) for step, ratio, error in numbers if ratio is not None and error is not None]
         return max((d for d, r, e in known if r - e < 2 and r + e >= 0.5 and not max(e, 0.5) < r < 2), default=0.0)
 
+    def bent_by_kinks(self, value: float) -> bool:
+        """Whether L1's kinks are why the eigenvalue is not confirmed: they bend upwards, as renders then do beside it."""
+        ratio = self.at_step
+        return self.confirmed is False and self.kinks > abs(value) and (ratio is None or ratio * value > value)
+
 
 class Carries(Struct, kw_only=True):
     """The Gaussian with most mass in an eigenvector.

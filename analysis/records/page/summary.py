@@ -95,15 +95,16 @@ def _end(end: Eigenvalue) -> str:
     if not end.is_reached:
         return f"{UNDETERMINED} (not reached)"
     value, renders = end.value or 0.0, end.renders
-    notes, said = [ONE], what_renders_say(value, renders) if renders else "not rendered"
+    notes = []  # but for the one that stands behind "not confirmed" as the reason
     if renders and renders.optimiser_step and (value > 0 or renders.confirmed):
-        at = renders.at_step
-        over = f"{'hidden by round-off' if at is None else rough(at * value)} over the optimiser's step in renders"
-        kinks = f"kinks of L1 add about {rough(renders.kinks)} at short steps" if renders.kinks else ""
-        beside = {"over the optimiser": over, "kinks": kinks}
-        notes = [note for told, note in beside.items() if note and told not in said] + notes
-    text = f"{solved(value, end.residual)}{apart(end.views_error)} ({'; '.join(notes)})"
-    return f"{text}{_carrier(end)}; {said}"
+        at, by_kinks = renders.at_step, renders.bent_by_kinks(value)
+        if renders.confirmed is not False or by_kinks or at is None:
+            over = "hidden by round-off" if at is None else rough(at * value)
+            notes.append(f"{over} over the optimiser's step in renders")
+        if renders.kinks and not by_kinks:
+            notes.append(f"kinks of L1 add about {rough(renders.kinks)} at short steps")
+    text = f"{solved(value, end.residual)}{apart(end.views_error)} ({'; '.join([*notes, ONE])})"
+    return f"{text}{_carrier(end)}; {what_renders_say(value, renders) if renders else 'not rendered'}"
 
 
 def _carrier(end: Eigenvalue) -> str:

@@ -116,11 +116,7 @@ def _with_settings(found: SplatFile, path: Path) -> SplatFile:
     settings = read_cfg_args(model_folder(path) / "cfg_args") if of_graphdeco else {}
     if not settings:
         settings = read_yaml_lines(path.resolve().parents[1])
-        return replace(
-            found,
-            antialiased=found.antialiased or settings.get("antialiased") is True,
-            settings={**found.settings, **settings},
-        )
+        return replace(found, antialiased=found.antialiased or settings.get("antialiased") is True, settings=settings)
     step, counted = found.step, path.resolve().parent.name.removeprefix("iteration_")
     if step is None and counted.isdigit():
         step = int(counted[:9])

@@ -19,10 +19,11 @@ class SplatFile:
     """Gaussians (float32) and what their file says beside them.
 
     format: in words.  tool: who trained them, a name of `splat.training.origin.presets`; None where the file does not say.
-    step: training steps.  antialiased: whether the renderer scaled opacities by the blur.  lossy: whether they were rounded to
-    a few bits.  extra: further numbers of each Gaussian, by name.  settings: of the tool, by its names.  train: names of the
-    images that it trained on, where the file says them.  notes: sentences on what was changed or is unsure.  other_axes: the
-    same Gaussians with y and z turned round, where writers of the format differ in that.
+    step: training steps.  antialiased: whether the renderer scaled opacities by the blur.  lossy: whether they were rounded
+    to a few bits.  extra: further numbers of each Gaussian, by name.  settings: of the tool, by its names.  train: names of
+    the images that it trained on, width: of the widest of them, px, where the file says them.  notes: sentences on what was
+    changed or is unsure.  other_axes: the same Gaussians with y and z turned round, where writers of the format differ in
+    that.
     """
 
     gaussians: Gaussians
@@ -34,6 +35,7 @@ class SplatFile:
     extra: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     train: tuple[str, ...] = ()
+    width: int | None = None
     notes: tuple[str, ...] = ()
     other_axes: Gaussians | None = None
 

@@ -33,7 +33,7 @@ COMMENTS = {
 }
 ANTIALIASED = re.compile(r"^(splatrendermode: mip|antialiased 1)$", re.I)
 TRAINED_BY, TRAINED_ON = "trained by ", "training views "  # our own comments; the names as a list in JSON
-WIDTH = re.compile(r"^training pictures (\d{2,6}) px wide$", re.M)  # another
+WIDTH = re.compile(r"^training pictures ([1-9]\d{0,5}) px wide$", re.M)  # another
 
 
 def read_splat_ply(content: bytes) -> SplatFile:
@@ -58,7 +58,7 @@ def read_splat_ply(content: bytes) -> SplatFile:
         antialiased=widths is not None or any(ANTIALIASED.match(line.strip()) for line in header.comments),
         lossy=plain,
         train=_train(header),
-        settings={"resolution": int(width[1])} if width else {},
+        width=int(width[1]) if width else None,
         extra={name: rows.numbers[name].astype(np.float32) for name in further},
         notes=(*(("it has plain colours and no spherical harmonics",) if plain else ()), *notes),
     )

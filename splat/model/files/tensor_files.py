@@ -218,7 +218,7 @@ def _gsplat(ranks: list[Any]) -> SplatFile:
         antialiased=first.get("antialiased") is True,
         extra=extra,
         train=names_of(first.get("training_views")),
-        settings={"resolution": first["training_width"]} if isinstance(first.get("training_width"), int) else {},
+        width=_step(first.get("training_width")) or None,
         notes=notes,
     )
 

@@ -109,7 +109,8 @@ def _require_said(found: SplatFile, ask: Foreign, path: Path, train: Sequence[st
 
 
 def _scene(found: SplatFile, ask: Foreign, preset: Preset) -> tuple[Scene, str | None, float]:
-    """The scene with the images that the trainer saw: those asked for, else as its settings say, else as it does by default."""
+    """The scene with the images that the trainer saw: those asked for, else as its file or settings say, else as it does by
+    default."""
     assert ask.scene is not None
     images, resolution = ask.images, found.settings.get("resolution", -1)
     named = found.settings.get("images")
@@ -118,13 +119,15 @@ def _scene(found: SplatFile, ask: Foreign, preset: Preset) -> tuple[Scene, str |
     background = WHITE if found.settings.get("white_background") is True else None
     downscale = 1.0 if ask.downscale is None else ask.downscale
     scene = load_scene(ask.scene, images, downscale, background)
-    if ask.downscale is None:
+    if ask.downscale is None and (found.width or preset.widest):
         width = max(frame.camera.width for frame in scene.frames)
-        if isinstance(resolution, int) and resolution in (1, 2, 4, 8):
+        if found.width:
+            downscale = max(width / found.width, 1.0)
+        elif isinstance(resolution, int) and resolution in (1, 2, 4, 8):
             downscale = float(resolution)
         elif isinstance(resolution, int | float) and 0 < resolution < width:
             downscale = width / resolution
-        elif preset.widest is not None and width > preset.widest:
+        elif preset.widest and width > preset.widest:
             downscale = width / preset.widest
         if downscale > 1:
             scene = load_scene(ask.scene, images, downscale, background)

@@ -152,8 +152,9 @@ def test_what_a_file_says_of_its_renderer_goes_with_it(folder, capsys):
     model = folder / "model/point_cloud/iteration_9"
     model.mkdir(parents=True)
     (model / "point_cloud.ply").write_bytes(splat_ply(MADE.truth.with_filter(torch.full((60,), 0.05))))
-    (folder / "model/cfg_args").write_text("Namespace(kernel_size=0.3)")
+    (folder / "model/cfg_args").write_text("Namespace(kernel_size=0.3, resolution=-1)")
     assert convert(model / "point_cloud.ply", folder / "m.ply") == 0
+    assert b"px wide" not in (folder / "m.ply").read_bytes()  # -1 is graphdeco's word for its default
     assert "no --trained-by renders as it was (antialiasing mip-splatting, blur 0.3" in " ".join(
         capsys.readouterr().err.split()
     )
