@@ -5,7 +5,7 @@ sum_m a_mc dY(d_m)/dmu_j, vectors over all channels.  Mostly no channel is clamp
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -14,10 +14,12 @@ from torch import Tensor
 
 from splat.backend.cpu.threads import over_range
 from splat.curvature.null.colour_space_cpu import project_colours
-from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, joined, orthonormal, row_space, spanned
+from splat.curvature.null.row_space import TOLERANCE, RowSpace, joined, orthonormal, row_space, spanned
 from splat.model.gaussians import Gaussians
 from splat.projection.formulas import ProjectionJacobian
 from splat.render.backend import CPU, backend_of
+
+AT_ONCE = 65536  # Gaussians whose rows are taken in float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +44,7 @@ class ColourSpace:
 
     def _by_kernel(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         (n, d, k), bands = x.shape, self.harmonics.basis.shape[2]
-        x, slopes = x.reshape(n, bands, 3 * k), self.slopes.basis.view(n, -1, bands, 3)
+        x, slopes = x.reshape(n, bands, 3 * k), self.slopes.basis.unflatten(2, (bands, 3))
         out = torch.empty_like(x)
         spaces = self.harmonics.basis, self.harmonics.rank, self.row, slopes, self.slopes.rank
         over_range(n, project_colours, *(each.numpy() for each in (*spaces, x, out)))
@@ -95,7 +97,7 @@ def seen_colours(
         sums.index_add_(0, index, terms)
         sizes.index_add_(0, index, terms.flatten(1).norm(dim=1))
     sums, sizes = sums[:, : 3 if slopes else 0] / count, sizes / count
-    chunks, tolerance = zip(*(x.split(CHUNK) for x in (rows, sums, sizes)), strict=True), TOLERANCE[like.dtype]
+    chunks, tolerance = zip(*(x.split(AT_ONCE) for x in (rows, sums, sizes)), strict=True), TOLERANCE[like.dtype]
     return _joined([_colours_of(r.double(), s.double(), a.double(), tolerance).to(like.dtype) for r, s, a in chunks])
 
 
@@ -115,11 +117,14 @@ def _colours_of(
         gaussian.append(other)
         weights.append(visible[other, :, c])
     spaces = row_space(harmonics[torch.cat(gaussian)] * torch.cat(weights)[:, :, None], tolerance)
-    colours = ColourSpace(spaces, row, RowSpace(slopes[:, :0], row.new_zeros(n)))
-    added = spanned(colours.without(slopes), sizes, tolerance)
+    # where harmonics are all of each channel's coefficients, slopes add nothing
+    some = torch.nonzero((spaces.rank[row] < harmonics.shape[2]).any(dim=1))[:, 0]
+    colours = ColourSpace(spaces, row[some], RowSpace(slopes[some, :0], row.new_zeros(len(some))))
+    added = spanned(colours.without(slopes[some]), sizes[some], tolerance)
     for _ in range(2):  # the second time removes what rounding left of the harmonics
         added = orthonormal(colours.without(added.basis), added.rank)
-    return replace(colours, slopes=added)
+    basis = slopes.new_zeros(n, *added.basis.shape[1:]).index_copy(0, some, added.basis)
+    return ColourSpace(spaces, row, RowSpace(basis, row.new_zeros(n).index_copy(0, some, added.rank)))
 
 
 def _joined(parts: Sequence[ColourSpace]) -> ColourSpace:

@@ -15,6 +15,7 @@ from torch import Tensor
 from splat.backend.cpu.threads import over_batch
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # rounding errors, relative to the largest singular value
+ROUNDING = 16 * torch.finfo(torch.float64).eps  # what is left of a row of length 1 that depends on those before
 CHUNK = 4096  # Gaussians at a time
 WIDEST = 32  # most rows and columns of matrices that CUDA decomposes in a batch; larger ones it takes one by one
 
@@ -49,15 +50,14 @@ class RowSpace:
 
 def orthonormal(rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSpace:
     """The space of linearly independent rows, `rank` of them, followed by padding."""
-    matrices = rows.mT.double().cpu()  # CUDA would form one Q after the other
-    directions = torch.empty_like(matrices.mT, memory_format=torch.contiguous_format)
+    basis = torch.empty_like(rows)
 
     def decompose(first: int, last: int) -> None:
-        directions[first:last] = torch.linalg.qr(matrices[first:last]).Q.mT
+        basis[first:last] = _gram_schmidt(rows[first:last].double())[1].to(rows)
 
-    over_batch(len(rows), decompose, matrices.device)
+    over_batch(len(rows), decompose, rows.device)
     kept = torch.arange(rows.shape[1], device=rows.device) < rank[:, None]
-    return RowSpace(torch.where(kept[:, :, None], directions.to(rows), 0.0), rank)
+    return RowSpace(torch.where(kept[:, :, None], basis, 0.0), rank)
 
 
 def joined(parts: Sequence[RowSpace]) -> RowSpace:
@@ -81,9 +81,9 @@ def spanned(rows: Float[Tensor, "n r d"], sizes: Float[Tensor, " n"] | None, tol
 
 
 def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m d"]]:
-    """Singular values, descending, and right singular vectors; computed on the CPU for wide rows."""
+    """Singular values, descending, and right singular vectors; where rows are fewer than columns, from square matrices."""
     home, (n, r, d) = rows.device, rows.shape
-    if rows.is_cuda and d > WIDEST:
+    if rows.is_cuda and min(r, d) > WIDEST:
         rows = rows.cpu()
     values, basis = rows.new_empty(n, min(r, d)), rows.new_empty(n, min(r, d), d)
 
@@ -91,9 +91,33 @@ def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float
         for start in range(first, last, CHUNK):
             some = slice(start, min(start + CHUNK, last))
             part = rows[some]
+            if r < d:  # L Q = rows has their singular values and, turned by Q, their right vectors
+                part, Q = _gram_schmidt(part)
+                _, values[some], turned = torch.linalg.svd(part)
+                basis[some] = turned @ Q
+                continue
             if rows.is_cuda and r > d:  # R has the same values and right vectors, and fewer rows: faster there
                 part = torch.linalg.qr(part, mode="r").R
             _, values[some], basis[some] = torch.linalg.svd(part, full_matrices=False)
 
     over_batch(n, decompose, rows.device)
     return values.to(home), basis.to(home)
+
+
+def _gram_schmidt(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n r r"], Float[Tensor, "n r d"]]:
+    """L, lower triangular, and Q of rows = L Q; rows of Q are orthonormal, or 0 where a row depends on those before.
+
+    Many small matrices at once on either device: CUDA would form one Q of a Householder decomposition after the other.
+    """
+    L, Q = rows.new_zeros(len(rows), rows.shape[1], rows.shape[1]), torch.zeros_like(rows)
+    for i in range(rows.shape[1]):
+        rest, before = rows[:, i, :, None], Q[:, :i]
+        for _ in range(2):  # the second time removes what rounding left of the rows before
+            along = before @ rest
+            L[:, i, :i] += along[:, :, 0]
+            rest = rest - before.mT @ along
+        length = rest.norm(dim=1, keepdim=True)
+        new = length > ROUNDING * rows[:, i].norm(dim=1)[:, None, None]
+        L[:, i, i] = torch.where(new, length, 0.0)[:, 0, 0]
+        Q[:, i] = torch.where(new, rest / length, 0.0)[:, :, 0]
+    return L, Q
