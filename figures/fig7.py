@@ -1,10 +1,11 @@
 """Figure after the paper's Fig. 7: the anisotropy index over two trainings, where they ended, and where they began.
 
 `python -m figures.fig7 RUN_3DGS RUN_STABLEGS --out fig7.png`.  Above: |lambda_max / lambda_min| (Eq. (3); open:
-negative) with its bracket, of records of a training, which confirm no end by renders, and the loss around both checkpoints
-along the two steepest eigenvectors.  Below: the same around the start of the first run, and sections through all three along
-e_1 and e_2.  All axes are those of the two ends (`manifold`), but for the start's surface, whose title says how much farther it
-reaches (a start may be hundreds of times wider than an end), and the sections' losses, which hold the sections alone.
+negative) with its bracket, of records of a training, which confirm no end by renders, behind it the range of all seeds where
+the runs are a sweep's METHOD/SEED, and the loss around both checkpoints along the two steepest eigenvectors.  Below: the same
+around the start of the first run, and sections through all three along e_1 and e_2.  All axes are those of the two ends
+(`manifold`), but for the start's surface, whose title says how much farther it reaches (a start may be hundreds of times wider
+than an end), and the sections' losses, which hold the sections alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -50,7 +53,9 @@ def draw(runs: Sequence[Path]) -> Figure:
             {name: {"color": each} for name, each in zip(names, RUNS, strict=False)},
             "eigenvalue_ratio",
         )
-        title = "Anisotropy index, one training each\n(no renders confirm its eigenvalues)"
+        counts = [_seeds(index, *each) for each in zip(runs, names, RUNS, strict=False)]
+        of = "one training each" if max(counts) == 1 else f"bands: {' and '.join(map(str, sorted({*counts})))} seeds"
+        title = f"Anisotropy index, {of}\n(no renders confirm its eigenvalues)"
         index.set(xlabel="step", ylabel="|λ max / λ min|", title=title)
         index.xaxis.set_major_locator(step_ticks())
         index.grid(True)
@@ -114,6 +119,16 @@ def _measured(run: Path, name: str) -> pd.DataFrame:
     if table.empty:
         raise InputError(f"expected records in {run / RECORDS}, all were skipped")
     return table
+
+
+def _seeds(axes: Axes, run: Path, name: str, colour: str) -> int:
+    """Draw the range of the index over the seeds beside a sweep's run of this method, where it has bounds; their number."""
+    beside = sorted(run.parent.glob(f"*/{RECORDS}")) if name != run.name else [run / RECORDS]
+    table = pd.concat(map(read_trajectory, beside), ignore_index=True)
+    bounded = np.isfinite(table[["eigenvalue_ratio_low", "eigenvalue_ratio_high"]]).all(axis=1)
+    sizes = table[bounded].set_index("step")["eigenvalue_ratio"].abs().groupby("step")
+    axes.fill_between(sizes.min().index, sizes.min(), sizes.max(), color=colour, alpha=0.15, linewidth=0)
+    return len(beside)
 
 
 if __name__ == "__main__":

@@ -201,7 +201,19 @@ def test_the_index_is_the_recorded_one_of_each_run(runs):
     dots = [line for line in index.lines if line.get_marker() == "o" and len(np.asarray(line.get_xdata()))]
     assert {to_hex(line.get_color()).upper() for line in dots} == set(RUNS[:2])
     assert [float(y) for line in dots for y in np.asarray(line.get_ydata())] == [4.0, 9.0, 16.0] * 2
-    assert fig7.names_of(runs) == ["3dgs", "stablegs"]
+    assert fig7.names_of(runs) == ["3dgs", "stablegs"] and "one training each" in index.get_title()
+
+
+def test_the_seeds_of_a_sweep_are_a_band_behind_the_index(runs):
+    for run, factor in ((runs[0], 5.0), (runs[1], 2.0)):
+        other = run.parent / "1"
+        other.mkdir()
+        table = rows()
+        table[[name for name in table if name.startswith("eigenvalue_ratio")]] *= factor
+        table.to_csv(other / "trajectory.csv", index=False)
+    index = fig7.draw(runs).axes[0]
+    reached = [band.get_paths()[0].vertices[:, 1].max() for band in index.collections]
+    assert {80.0, 32.0} <= set(np.round(reached, 6)) and "bands: 2 seeds" in index.get_title()
 
 
 @pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
