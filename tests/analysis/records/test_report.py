@@ -182,6 +182,11 @@ def test_the_page_opens_with_the_gaussian_that_carries_the_steepest_direction_th
     assert order == sorted(order) and re.findall(r'viewBox="([^"]*)"', text) == ["0 0 8 6", "0 0 8 6"]
     assert text.count('<ellipse cx="2.0" cy="1.0" rx="2.0" ry="2.0" transform="rotate(28.6') == 2
     assert 'id="name">2 of 3: b &lt;i&gt;.png<' in text and 'value="1" aria-label' in text
+    assert "<rect" not in text and "The render: the Gaussian" in text  # the part is the whole picture
+    data = carried("a.png")
+    data["eigenvalues"]["max"]["carrier"]["outline"][2] = 0.5
+    narrow = with_views(tmp_path / "narrow", names, data).read_text(encoding="utf-8")
+    assert '<rect x="1" y="0" width="2" height="2"/>' in narrow and "The render in the frame: the Gaussian" in narrow
     data = carried("a.png")
     data["checks"]["symmetry"] |= {"value": 0.5, "passed": False}
     assert "<svg" not in with_views(tmp_path / "doubtful", names, data).read_text(encoding="utf-8")
