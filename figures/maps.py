@@ -9,6 +9,7 @@ Grey: no splat with a value.  The arrow ends of a scale say that there are value
 """
 
 import math
+import textwrap
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,12 +38,12 @@ from analysis.records.run_files import (
     read_maps,
 )
 from figures.scripts import drawn_by, folder_script
-from figures.style import BLACK, BLUE, GREEN, VERMILION, few_decades, literal, new_figure, round_number, save, style
+from figures.style import BLACK, RUNS, VERMILION, few_decades, literal, new_figure, round_number, save, style
 
 SAME = 0.02  # greatest difference of curves that look alike, of their axis
 WIDTH, TALLEST = 7.0, 9.0  # inches
 HEAD, LEGEND = 0.35, 0.5  # inches: above a picture, beneath one with a scale
-DOTS = 160  # an inch
+DOTS, WRAP = 160, 58  # an inch; characters above one of two pictures
 
 
 def _sheet(rows: int, columns: int, shape: tuple[int, int], legends: int) -> tuple[Figure, np.ndarray]:
@@ -118,7 +119,8 @@ def draw_fragility(maps: dict[str, np.ndarray], index: int, record: MapRecord) -
         figure, places = _sheet(2, 2, maps["error"].shape, 2)
         figure.suptitle(literal(f"{view}: where it is fragile; shares are of all Gaussians in sight"))
         for axes, (name, title) in zip(places.flat, titles.items(), strict=False):
-            show_scaled(axes, maps[name], shades[name], title, f"{shades[name].title}; bright: fragile")
+            words = textwrap.fill(title, WRAP)
+            show_scaled(axes, maps[name], shades[name], words, f"{shades[name].title}; bright: fragile")
         _draw_swaps(places[1, 1], fragile.swaps, index)
     return figure
 
@@ -145,6 +147,7 @@ def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
 def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
     """An end of the spectrum: the view with the carriers, and its part at -step, 0 and +step."""
     left, top, right, bottom = end.crop
+    length = f"\n({end.length})" if end.length else ""
     share = percent(sum(each.share for each in end.carriers))
     back, _, forth = (_signed(loss / end.losses[1] - 1) for loss in end.losses)
     with style():
@@ -156,30 +159,22 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
         )
         _show(axes["photograph"], maps["photograph"], f"Gaussians with {share} of {end.name}")
         _show(axes["zero"], maps["zero"], f"Render: loss {quantity(end.losses[1])}")
-        _show(axes["minus"], maps["minus"], f"A step back: loss {back}")
-        _show(axes["plus"], maps["plus"], f"A step forth: loss {forth}")
+        _show(axes["minus"], maps["minus"], f"A step back: loss {back}{length}")
+        _show(axes["plus"], maps["plus"], f"A step forth: loss {forth}{length}")
         show_scaled(
             axes["difference"], maps["difference"], end.difference, "Render forth minus back", end.difference.unit
         )
         for picture, shift in ((axes["view"], (0, 0)), (axes["photograph"], (left, top))):
-            for carrier in reversed(end.carriers):  # the first above the others
-                picture.add_patch(_outline(carrier, shift, _colour(carrier, end)))
-        for line, carrier in enumerate(end.carriers):
-            axes["photograph"].text(
-                0.03, 0.95 - 0.12 * line, f"{carrier.gaussian:,}: {percent(carrier.share)}",
-                color=_colour(carrier, end), va="top", transform=axes["photograph"].transAxes,
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.2},
-            )  # fmt: skip
+            for carrier, colour in [*zip(end.carriers, RUNS)][::-1]:  # the first above the others
+                picture.add_patch(_outline(carrier, shift, colour))
+        for line, (carrier, colour) in enumerate(zip(end.carriers, RUNS)):  # beneath, where they cover nothing
+            words, place = f"{carrier.gaussian:,}: {percent(carrier.share)}", (line % 3 / 3, -0.03 - 0.08 * (line // 3))
+            axes["photograph"].text(*place, words, color=colour, va="top", transform=axes["photograph"].transAxes)
     return figure
 
 
 def _signed(share: float) -> str:
     return f"{'+' * (share > 0)}{rough(100 * share)}%"
-
-
-def _colour(carrier: Carrier, end: Steepest) -> str:
-    """Not of the colours of a difference."""
-    return BLUE if carrier is end.carriers[0] else GREEN
 
 
 def _outline(carrier: Carrier, shift: tuple[int, int], colour: str) -> Ellipse:

@@ -12,6 +12,7 @@ import pytest
 from matplotlib.axes._secondary_axes import SecondaryAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.contour import QuadContourSet
+from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 from msgspec import convert
 from PIL import Image
@@ -127,12 +128,20 @@ def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, m
 def test_titles_of_renders_along_an_end_stay_apart(tmp_path):
     written_map(tmp_path / "map", {})
     end = json.loads((tmp_path / "map" / "map.json").read_text())["steepest"][0]
-    end |= {"step": 0.00373, "losses": [0.07408, 0.0735, 0.07414]}
+    end["carriers"] = [end["carriers"][0] | {"gaussian": 123456 + i, "share": 0.152} for i in range(5)]
+    end |= {"step": 0.00373, "length": "1/32 × the optimiser's step", "losses": [0.07408, 0.0735, 0.07414]}
     pictures = {name: np.zeros((126, 168, 3), np.uint8) for name in END_MAPS} | {
         "difference": np.zeros((126, 168), np.uint8)
     }
     figure = maps.draw_steepest(pictures, convert(end, Steepest))
-    require_apart(words(figure, laid_out(figure)))
+    require_apart(said := words(figure, laid_out(figure)))
+    assert sum("(1/32 × the optimiser's step)" in text for text, _ in said) == 2
+    colours = [each.get_edgecolor() for axes in figure.axes for each in axes.patches if isinstance(each, Ellipse)]
+    assert len(colours) == 10 and len(set(colours)) == 5
+    part = next(axes for axes in figure.axes if "15%" in str([text.get_text() for text in axes.texts]))
+    assert all(
+        text.get_window_extent().y1 < part.get_window_extent().y0 for text in part.texts
+    )  # they cover no outline
 
 
 def test_the_drawn_traces_are_the_recorded_ones(tmp_path):
