@@ -43,9 +43,8 @@ def run_trajectory(options: TrajectoryOptions) -> int:
     with replacing(path) as partial:
         table.to_csv(partial, index=False, errors="backslashreplace")
     console.print(first_and_last(table))
-    say(
-        "* the ratio rests on eigenvalues that no renders have confirmed: landscape probe renders them", console=console
-    )
+    doubt = "* the ratio rests on eigenvalues that no renders have confirmed: landscape probe renders them"
+    say(doubt, console=console)
     if len(versions := table.filter(["of_formulas"]).dropna().drop_duplicates()) > 1:
         say(f"records of {len(versions)} versions of the formulas do not compare: train again", style="yellow")
     (out / PICTURE).unlink(missing_ok=True)
