@@ -61,7 +61,8 @@ def draw(runs: Sequence[Path]) -> Figure:
         index.grid(True)
         drawn = [surface(figure, (2, 3, 2 + i), end, scale, f"{names[i]}, end") for i, end in enumerate(ends)]
         figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], **BAR)
-        title = f"{BEGINNING} of {names[0]},\n{rough(wide.reach / scale.reach)} times the steps at the last checkpoints"
+        wider = rough(wide.reach / scale.reach)
+        title = f"{BEGINNING} of {names[0]}, a window\n{wider} times as wide as at the last checkpoints"
         around, colours = surface(figure, (2, 3, 4), start, wide, title)
         figure.colorbar(colours, ax=around, **BAR)
         for axis, direction in enumerate(("e₁", "e₂")):

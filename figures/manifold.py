@@ -178,7 +178,7 @@ def surface(
     axes.tick_params(labelsize=5, pad=-3)
     axes.set_xlabel(f"e₁{unit_suffix(scale.steps)}", fontsize=6, labelpad=-4)
     axes.set_ylabel(f"e₂{unit_suffix(scale.steps)}", fontsize=6, labelpad=-3)
-    axes.set_title(f"{literal(title)}\n{scale.loss_label}", y=0.95)
+    axes.set_title(f"{literal(title)};\n{scale.loss_label}", y=0.95)
     axes.view_init(elev=45, azim=-58)  # into the valley, over its walls
     # the layout does not count the labels of such axes
     axes.set_box_aspect(None, zoom=0.72)  # pyright: ignore[reportArgumentType]

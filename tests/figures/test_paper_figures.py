@@ -1,5 +1,6 @@
 """The figures after the paper's Figs. 1 and 7: drawn from records, all landscapes to one scale; what is missing is named."""
 
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -94,7 +95,7 @@ def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
     assert (
         surfaces[2]
         .get_title()
-        .startswith(f"start of 3dgs,\n{rough(wide.reach / reach)} times the steps at the last checkpoints\n")
+        .startswith(f"start of 3dgs, a window\n{rough(wide.reach / reach)} times as wide as at the last checkpoints;\n")
     )
     assert surfaces[2].get_xlim()[1] == pytest.approx(wide.reach / 10.0**wide.steps)
     across, along = figure.axes[-2:]
@@ -164,6 +165,7 @@ def test_for_a_paper_titles_are_letters_and_the_caption_lies_beside_it(runs, tmp
     assert sorted(letters) == [f"({letter})" for letter in "abcdef"][: len(letters)] and len(letters) >= 4
     caption = (tmp_path / "one.paper.txt").read_text()
     assert "(a) " in caption and caption.count("\n") == 1
+    assert not re.search(r"[^;] change of loss", caption)  # the titles of a panel are set apart
     if module is fig1:
         said = (
             "(a) 3dgs, step 2,000: λ max ",
