@@ -23,7 +23,7 @@ from torch import Tensor
 from analysis.console.stages import Stage
 from analysis.measures.memory import basis_within, vectors_within
 from analysis.measures.split_control import SplitControl, split_control
-from analysis.measures.units import Metric, optimiser_units, scene_size, scene_units
+from analysis.measures.units import Metric, optimiser_units
 from analysis.records import schema
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord
@@ -168,11 +168,6 @@ def _metric(
     """The unit in words, and D of a scene; the split scene has the units of the trained one."""
     if metric == "parameters":
         return "the stored parameters as they are", lambda _: None
-    if metric == "scene":
-        size = scene_size(objective)
-        return f"positions in units of the scene's size, {quantity(size)} world units", lambda scene: scene_units(
-            scene, size
-        )
     rates, extent = training.config.rates, training.extent
     positions = f"{quantity(rates.position * extent)} (extent {quantity(extent)})"
     if not (optimiser_units(objective, rates, extent) > 0).all():

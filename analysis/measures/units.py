@@ -1,7 +1,6 @@
 """Metrics of the parameter space: in which units curvature is compared, as D of D H D (`landscape.ScaledOperator`).
 
 parameters   D = 1: curvature per squared unit of the parameters
-scene        positions in units of the scene's size, the rest as it is: what two scenes may be compared in
 optimiser    D the learning rate of every parameter at the first step: curvature per step of the training
 
 A curvature unit is a step along one direction: that within which the curvature alone changes the loss by RISE of it.
@@ -23,7 +22,7 @@ from splat.training.state import LearningRates, learning_rates, position_rate
 
 RISE = 0.001  # of the loss, within a curvature unit
 UNITS = 3.0  # curvature units each way that a slice reaches by default
-Metric = Literal["parameters", "scene", "optimiser"]
+Metric = Literal["parameters", "optimiser"]
 FACING = 0.7  # views are forward-facing where every axis keeps this share of its length along their mean
 
 
@@ -38,13 +37,6 @@ def scene_size(objective: SceneObjective) -> float:
         return float(depth[depth > 0].median())
     centres = torch.stack([camera.centre for camera in cameras])
     return float((centres - centres.mean(dim=0)).norm(dim=1).mean())
-
-
-def scene_units(objective: SceneObjective, size: float | None = None) -> Float[Tensor, " p"]:
-    """D with the scene's size for positions; size: world units, `scene_size` by default."""
-    scale = torch.ones_like(objective.active.flat)
-    scale[objective.blocks["means"]] = scene_size(objective) if size is None else size
-    return scale
 
 
 def step_lengths(rates: LearningRates, extent: float) -> dict[str, float]:

@@ -40,10 +40,9 @@ class ProbeOptions:
     Not under torchrun."""
     split_control: bool = False
     """The same, and of the scene with every Gaussian split in two: what their number alone does.  2.5 times as long."""
-    metric: Annotated[Literal["parameters", "scene", "optimiser"], arg(metavar="NAME")] = "parameters"
+    metric: Annotated[Literal["parameters", "optimiser"], arg(metavar="NAME")] = "parameters"
     """Units of --per-attribute, which it implies.
-    parameters: as stored.  scene: positions in units of the scene's size.
-    optimiser: in units of the first step's learning rates."""
+    parameters: as stored.  optimiser: of the first step's learning rates."""
     measures: bool = False
     """Also order fragility, field sharpness, critical sharpness, that of Adam's own scaling, and open
     curvature, at the training views and at the cameras of those held out, in an eighth of a probe's time."""

@@ -3,7 +3,7 @@
 An operator H has n rows (`dim`), named ranges of rows (`blocks`; for a scene one per attribute), a `dtype`, and
 `apply(V) -> H V` for k vectors at once, V of shape (n, k).  Operators compose:
 
-    SumOperator         sum_i w_i H_i
+    SumOperator         sum_i H_i
     RestrictedOperator  E^T H E     one block, E its rows of the identity
     ScaledOperator      D H D       a change of units: the curvature in theta / d, D = diag(d)
     ProjectedOperator   P H P       P an orthogonal projector, to remove a known null space
@@ -136,14 +136,11 @@ class DenseOperator:
 
 
 class SumOperator:
-    """sum_i weights_i H_i, all weights 1 where None.  Raises ValueError unless all H_i have the same rows, blocks and dtype."""
+    """sum_i H_i.  Raises ValueError unless all H_i have the same rows, blocks and dtype."""
 
-    def __init__(self, terms: Sequence[SymmetricOperator], weights: Sequence[float] | None = None) -> None:
+    def __init__(self, terms: Sequence[SymmetricOperator]) -> None:
         if not terms:
             raise ValueError("expected at least one operator to sum, got none")
-        weights = [1.0] * len(terms) if weights is None else weights
-        if len(weights) != len(terms):
-            raise ValueError(f"expected one weight per operator ({len(terms)}), got {len(weights)}")
         first = terms[0]
         for term in terms[1:]:
             if (term.dim, term.dtype, dict(term.blocks)) != (first.dim, first.dtype, dict(first.blocks)):
@@ -151,14 +148,14 @@ class SumOperator:
                     f"expected operators of {first.dim} rows, {first.dtype} and blocks {', '.join(first.blocks)}, "
                     f"got {term.dim} rows, {term.dtype} and blocks {', '.join(term.blocks)}"
                 )
-        self.terms, self.weights = tuple(terms), tuple(weights)
+        self.terms = tuple(terms)
         self.dim, self.dtype, self.blocks = first.dim, first.dtype, first.blocks
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         require_vectors(V, self.dim, self.dtype)
-        total = self.weights[0] * self.terms[0].apply(V)
-        for weight, term in zip(self.weights[1:], self.terms[1:], strict=True):
-            total.add_(term.apply(V), alpha=weight)
+        total = self.terms[0].apply(V).clone()
+        for term in self.terms[1:]:
+            total += term.apply(V)
         return total
 
 

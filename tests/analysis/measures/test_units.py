@@ -6,17 +6,15 @@ from math import log
 import pytest
 import torch
 
-from analysis.measures.units import optimiser_units, scene_size, scene_units, step_rises
-from landscape import ScaledOperator
+from analysis.measures.units import optimiser_units, scene_size, step_rises
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.training.state import LearningRates
 from tests.splat.held_scenes import BACKGROUND, two_views
-from tests.splat.random_scenes import random_gaussians, random_like
+from tests.splat.random_scenes import random_gaussians
 from tests.splat.tiny import SMOOTH, tiny_gaussians, tiny_views
-from tests.splat.tolerances import relative_error
 
 
 def objective_in_a_world(unit: float = 1.0, apart: float = 0.0) -> SceneObjective:
@@ -29,17 +27,6 @@ def objective_in_a_world(unit: float = 1.0, apart: float = 0.0) -> SceneObjectiv
     turn = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
     views[0] = replace(views[0], camera=replace(views[0].camera, rotation=turn @ views[0].camera.rotation))
     return SceneObjective(gaussians, views, LossSettings("charbonnier"), BACKGROUND)
-
-
-def test_curvature_in_scene_units_is_independent_of_world_units():
-    products = []
-    for unit in (1.0, 1.7):
-        objective = objective_in_a_world(unit)
-        D = scene_units(objective)
-        products.append(ScaledOperator(SceneHessian(objective), D).apply(random_like((len(D), 2), 3)))
-        plain = SceneHessian(objective).apply(random_like((len(D), 2), 3))
-    assert relative_error(products[1], products[0]) < 1e-10
-    assert relative_error(plain, products[0]) > 0.1  # in the world's own units it does
 
 
 def test_a_scenes_size_is_its_depth_or_the_distance_of_its_cameras():

@@ -35,7 +35,6 @@ SCALE = torch.logspace(-2, 1, N, dtype=torch.float64)
 COMPOSED = {
     "dense": (DenseOperator(A, BLOCKS), A),
     "sum": (SumOperator([DenseOperator(A), DenseOperator(B)]), A + B),
-    "weighted sum": (SumOperator([DenseOperator(A), DenseOperator(B)], [0.5, -2.0]), 0.5 * A - 2 * B),
     "scaled": (ScaledOperator(DenseOperator(A), SCALE), SCALE[:, None] * A * SCALE),
     "projected": (
         ProjectedOperator(DenseOperator(A), project),
@@ -103,7 +102,6 @@ def test_an_unknown_block_is_refused_with_the_known_ones():
 def test_a_sum_needs_terms_that_fit():
     misused("at least one", SumOperator, [])
     misused("7 rows", SumOperator, [DenseOperator(A), DenseOperator(A[:3, :3])])
-    misused("one weight per operator", SumOperator, [DenseOperator(A)], [1.0, 2.0])
 
 
 def test_scales_must_fit_and_be_finite():

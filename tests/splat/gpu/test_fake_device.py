@@ -12,7 +12,6 @@ from analysis.measures.depth import depth_rises, depth_split
 from analysis.measures.localization import conditions, localize
 from analysis.measures.split_control import split_control
 from analysis.measures.steepest import heaviest, kink_curvature
-from analysis.measures.units import scene_units
 from landscape.eigen.lanczos import lanczos
 from landscape.operators.operator import DenseOperator
 from landscape.traces.trace import TraceSettings
@@ -108,7 +107,7 @@ def test_products_of_a_scene_stay_on_the_device_and_do_not_wait(monkeypatch):
         fake.brought.clear()
         hessian.apply(V)
         assert not +fake.waits and not +fake.brought  # the host runs ahead
-        _ = objective.gradient, objective.block_diagonal(approximate=True), objective.loss(flat), scene_units(objective)
+        _ = objective.gradient, objective.block_diagonal(approximate=True), objective.loss(flat)
         known = BlockEigenvectors(objective, *objective.approximate_blocks)
         known.steepest(1, 1)
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
