@@ -1,4 +1,4 @@
-"""Image losses and metrics, in plain torch: the specification of the loss kernels.
+"""Settings of the image losses, their window, and metrics.  In plain torch the losses are in `tests/splat/photometric.py`.
 
 Images are (3, h, w) in [0, 1].  Every loss is a mean over pixels and channels.
 
@@ -99,27 +99,6 @@ def ssim_map(image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"]) -> F
     var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
     luminance = (2 * mu_x * mu_y + C1) / (mu_x * mu_x + mu_y * mu_y + C1)
     return luminance * (2 * cov + C2) / (var_x + var_y + C2)
-
-
-def pixel_loss(image: Tensor, target: Tensor, kind: PixelLoss, eps: float) -> Tensor:
-    residual = image - target
-    if kind == "l1":
-        return residual.abs().mean()
-    if kind == "l2":
-        return residual.square().mean()
-    return (residual.square() + eps * eps).sqrt().mean()
-
-
-def photometric_loss(
-    image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], settings: LossSettings = LossSettings()
-) -> Float[Tensor, ""]:
-    """The loss of one view, a scalar that torch can differentiate."""
-    loss = settings.pixel_weight * pixel_loss(image, target, settings.pixel, settings.eps)
-    if settings.ssim_weight:
-        height, width = image.shape[1:]
-        m, weight = settings.margin, settings.structural(height, width)
-        loss = loss + weight * (1 - ssim_map(image, target)[:, m : height - m, m : width - m]).sum()
-    return loss
 
 
 def psnr(image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"]) -> float:

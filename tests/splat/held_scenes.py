@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from splat.losses.reference import LossSettings, photometric_loss
+from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.render.render import render
 from splat.scenes.view import View
+from tests.splat.photometric import photometric_loss
 from tests.splat.random_scenes import random_camera
 
 BACKGROUND = torch.tensor([0.2, 0.5, 0.875], dtype=torch.float64)

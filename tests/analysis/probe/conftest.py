@@ -9,7 +9,6 @@ import torch
 
 from analysis.commands.cli import main
 from analysis.records.records import Record
-from splat.losses.reference import photometric_loss
 from splat.render.render import render
 from splat.scenes.synthetic import synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -17,6 +16,7 @@ from splat.training.adam import Adam
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import ScreenGradients
 from tests.analysis.probe.probed import SCENE, unlimited
+from tests.splat.photometric import photometric_loss
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,10 @@ import torch
 
 from analysis.commands.cli import main
 from analysis.train import command
-from splat.losses.reference import photometric_loss, psnr
+from splat.losses.reference import psnr
 from splat.render.render import render
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from tests.splat.photometric import photometric_loss
 
 STEPS = 25
 

@@ -13,7 +13,7 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.losses.cpu.loss import CpuViewLoss
-from splat.losses.reference import LossSettings, photometric_loss
+from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.model.settings import Antialias, RenderSettings
 from splat.projection.reference import project
@@ -21,6 +21,7 @@ from splat.render.render import render
 from splat.scenes.view import View
 from tests.oracles import central_difference
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, mean_loss, two_views
+from tests.splat.photometric import photometric_loss
 from tests.splat.random_scenes import ANTIALIASED, MODES, filtered, random_camera, random_gaussians, random_like
 from tests.splat.tiny import SMOOTH
 from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, NUMPY, errors_by_block, relative_error

@@ -7,10 +7,11 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from splat.gpu.loss import CudaImageLoss, CudaViewLoss
 from splat.losses.autograd import view_loss
-from splat.losses.reference import LossSettings, photometric_loss
+from splat.losses.reference import LossSettings
 from splat.render.backend import backend_of
 from tests.splat.gpu.interpreted import emulate
 from tests.splat.losses.test_losses import SETTINGS, image_and_target, truth, truth_of_both
+from tests.splat.photometric import photometric_loss
 from tests.splat.random_scenes import random_like
 from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, relative_error
 

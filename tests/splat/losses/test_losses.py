@@ -12,10 +12,11 @@ from torch import Tensor
 
 from splat.losses.autograd import view_loss
 from splat.losses.cpu.loss import CpuViewLoss
-from splat.losses.reference import WINDOW, LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map, window
+from splat.losses.reference import WINDOW, LossSettings, PixelLoss, psnr, ssim, ssim_map, window
 from splat.render.backend import backend_of
 from tests.oracles import similarity_by_windows
 from tests.refusals import refused
+from tests.splat.photometric import photometric_loss
 from tests.splat.random_scenes import random_like
 from tests.splat.tolerances import DERIVATIVE, DTYPES, IMAGE, relative_error
 

@@ -8,7 +8,7 @@ import torch
 
 from landscape.errors import InputError
 from splat.backend.cpu.adam import EPS
-from splat.losses.reference import LossSettings, photometric_loss
+from splat.losses.reference import LossSettings
 from splat.model.settings import RenderSettings
 from splat.projection.antialias import sampling_widths
 from splat.render.forward import background_of
@@ -24,6 +24,7 @@ from splat.training.loop import prepare, train, with_background
 from splat.training.score.evaluate import evaluate
 from splat.training.state import LearningRates, TrainConfig, Training, learning_rates, position_rate
 from tests.refusals import refused
+from tests.splat.photometric import photometric_loss
 from tests.splat.tiny import EXTENT, REFERENCE, ended, tiny_config, tiny_gaussians, tiny_views, trained
 
 ONLY_ADAM = DensifySettings(enabled=False)

@@ -6,7 +6,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from splat.losses.reference import photometric_loss
 from splat.model.camera import Camera
 from splat.model.capture import capture_geometry
 from splat.render.render import render
@@ -16,6 +15,7 @@ from splat.training.methods import corgs
 from splat.training.methods.corgs import CoRGS, CoRGSMethod, confirmed, pseudo_view
 from splat.training.state import Step, TrainConfig, Training
 from tests.refusals import refused
+from tests.splat.photometric import photometric_loss
 from tests.splat.random_scenes import random_camera
 from tests.splat.tiny import EXTENT, a_step, both_of, tiny_config, tiny_gaussians, tiny_views
 

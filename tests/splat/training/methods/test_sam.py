@@ -5,12 +5,12 @@ from math import sqrt
 import pytest
 import torch
 
-from splat.losses.reference import photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training import state
 from splat.training.methods.sam import SAM, ascent
 from splat.training.state import LearningRates, Step, learning_rates, position_rate
+from tests.splat.photometric import photometric_loss
 from tests.splat.tiny import EXTENT, a_step, both_of
 
 

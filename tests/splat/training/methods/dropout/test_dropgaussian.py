@@ -6,11 +6,11 @@ from math import sqrt
 import pytest
 import torch
 
-from splat.losses.reference import photometric_loss
 from splat.render.render import render
 from splat.training.loop import train
 from splat.training.methods.dropout.dropgaussian import DropGaussian, DropGaussianMethod
 from splat.training.state import TrainConfig, Training
+from tests.splat.photometric import photometric_loss
 from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views, trained
 
 

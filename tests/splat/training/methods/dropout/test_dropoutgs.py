@@ -3,10 +3,11 @@
 import pytest
 import torch
 
-from splat.losses.reference import LossSettings, photometric_loss
+from splat.losses.reference import LossSettings
 from splat.render.render import render
 from splat.training.methods.dropout import dropoutgs
 from splat.training.methods.dropout.dropoutgs import DropoutGS
+from tests.splat.photometric import photometric_loss
 from tests.splat.tiny import a_step, both_of
 
 

@@ -7,7 +7,6 @@ import torch
 
 from landscape.errors import InputError
 from splat.curvature.traces import exact_traces
-from splat.losses.reference import photometric_loss
 from splat.render.render import render
 from splat.training import state
 from splat.training.densify import DensifySettings
@@ -19,6 +18,7 @@ from splat.training.methods.stablegs.attribute_probe import Caps, Constants, Pro
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.methods.stablegs.viewpoint_probe import ViewpointSettings
 from splat.training.state import TrainConfig, Training
+from tests.splat.photometric import photometric_loss
 from tests.splat.random_scenes import random_like
 from tests.splat.tiny import EXTENT, a_step, both_of, ended, tiny_config, tiny_gaussians, tiny_views, trained
 from tests.splat.training.methods.stablegs.test_attribute_probe import probed_again
