@@ -14,7 +14,7 @@
     depth *             the positions' gradient and curvature along the rays and across them, and finite steps both ways
 
 * not in a quick probe.  Estimators stop at their accuracy or at a limit on products; their results say which.  Numbers depend
-on the seed, and on free memory where a note says so; also those of stages kept from an earlier run.
+on the seed, and on free memory where it limits a basis or the density's runs; of a stage kept by an earlier run, on that run's.
 """
 
 from collections.abc import Sequence
@@ -77,8 +77,8 @@ LEFT_OUT = {  # notes on stages that the settings exclude
     "density": "the spectral density was left out, and the indices that need it",
     "depth": "positions along and across the rays were left out",
 }
-# renders along the ends: from the optimiser's step HALVINGS halvings down (so that three reach a tenth of it), and up to the
-# first doubling at which the curvature changes the loss by RISE, but 1 to MOST_DOUBLINGS doublings
+# renders along the ends: from the optimiser's step HALVINGS halvings down (so that the shortest run of three ends near a tenth
+# of it), and up to the first doubling at which the curvature changes the loss by RISE, but 1 to MOST_DOUBLINGS doublings
 RISE, HALVINGS, MOST_DOUBLINGS = 0.01, 5, 5
 MIXED = 0.1  # largest error of an eigenvector whose participation is recorded: 1% of its mass lies elsewhere
 FEW_POINTS = 8  # renders for the estimate of a render's noise
@@ -198,7 +198,7 @@ def _traces(at: _Point, generator: torch.Generator, report: Progress, _: list[st
 
 
 def _ends(at: _Point, generator: torch.Generator, report: Progress, notes: list[str]) -> Search:
-    """Both ends of the spectrum, with the largest basis that fits into memory.
+    """Both ends of the spectrum, with as much of the basis asked for as fits into memory.
 
     The null space that is known is lifted off 0, where it would be the end of a semi-definite spectrum.
     """

@@ -3,13 +3,13 @@
     c(d) = (L(theta + d v) - 2 L(theta) + L(theta - d v)) / d^2  =  v.H v + d^2 L4 / 12 + ...       L4 = d^4 L / dv^4
 
 round-off   4 sqrt(6 noise^2 + 2 (d s)^2) / d^2: four standard errors of a second difference of values with independent errors.
-            d s, s = eps |theta * H v| / sqrt(12): the rounding of theta + d v, times the slope d H v there
+            d s with s = eps |theta * H v| / sqrt(12): the rounding of theta + d v, times the slope d H v there
 confirmed   a step where c(d) is beyond its round-off, has the sign of v.H v, and is between half and twice it.  A curvature is
             confirmed by three such steps, each twice the one before: the curvature 2 |d| / d^2 of a kink at the
             centre is halved from one to the next, so that it never is
 refuted     a step where no value within round-off of c(d) is between half and twice v.H v.  Round-off grows as d shrinks, by
-            up to 1 / d^2, and hides the shortest steps of any loss: a curvature stays open only where no step is refuted, or
-            where three in a row are partly confirmed and none refuted
+            up to 1 / d^2, and hides the shortest steps of any loss.  These alone leave no curvature open: it is so only where
+            no step of at least `least` is refuted, or where of three in a row some confirm and none is refuted
 noise       standard deviation of the error of one value of L, from differences of order k = 4 of values at small even steps
             along v, in which the smooth part of L cancels: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and
             Wild 2011, Sec. 2).  At least the resolution of the numbers that the objective returns (Python floats that are all
@@ -112,7 +112,7 @@ def finite_probe(
     middle, here = at(0.0)
     if not isfinite(middle):
         raise InputError(f"expected a finite objective at the centre, got {middle}")
-    # eps |theta_i / v_i|, averaged with weights v_i^4: the step along v that rounding of theta makes
+    # eps times the root mean square of theta_i / v_i with weights v_i^4: the step along v that rounding of theta makes
     rounding = torch.finfo(center.dtype).eps * float((origin * v).norm() / v.square().norm())
     spacing = max(steps[0] / CLOSER, ROUNDINGS * rounding)
     close = [at((k - (noise_points - 1) / 2) * spacing)[0] for k in range(noise_points)]

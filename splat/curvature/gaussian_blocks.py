@@ -41,7 +41,8 @@ class PerGaussianBlocks(ShortRepr):
     def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
         """Trace of each attribute's block, summed in double precision.
 
-        quats: unit quaternions; P projects them out, and traces are of P B P.  scale: diag D; traces are of D P B P D.
+        quats: unit quaternions; P projects them out, and traces are of P B P.  scale: the diagonal of D, as Gaussians; traces
+        are of D P B P D.
         """
         diagonals = self.diagonals if quats is None else self.diagonals_across(quats)
         if scale is not None:

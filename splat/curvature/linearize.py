@@ -42,7 +42,7 @@ from splat.render.backend import Adjoint, Raster, Tangent, backend_of
 from splat.render.formulas import BLOCK_SUMS
 from splat.render.forward import rasterize_view, touches
 
-# a linearized loss keeps: target, its moments, gradient, SSIM's blur(S_p) (`losses/formulas.py`), second derivatives, a product
+# a linearized loss keeps: target, its moments, gradient, SSIM's blur(S_p) (`losses/formulas.py`), l'', l'' of ones
 LOSS_PLANES = 34
 DOUBLE_BLOCK = 8 * 9 * 9  # bytes of a 9 x 9 block in double precision
 VECTORS = 8  # most vectors in a product at a time: more would not fit into the second-level cache

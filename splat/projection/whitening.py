@@ -43,7 +43,7 @@ def whitening(splat):
 
 @formula
 def cancellation(W):
-    """a c / (a c - b^2): the order of how many times larger than their sum the terms of a whitened tangent can be."""
+    """a c / (a c - b^2): about how many times the terms of a whitened tangent can exceed their sum."""
     along, across, shear = W
     return 1 + (shear * across / along) ** 2
 

@@ -4,14 +4,14 @@ A prime marks a tangent (in code: d..), v_ a cotangent.  Per pixel, splats in or
 mean in the splat's whitened coordinates (u, v) (`projection/whitening.py`), opacity o, colour c, transmittance T in front of
 the splat:
 
-    l = log2 alpha = log2 o - u^2 - v^2      alpha = min(cap, 2^l)
+    l = log2 o - u^2 - v^2      alpha = min(cap, 2^l)
     active where l >= cut (from alpha_min and contour) and the pixel has not stopped; else alpha = 0, and no update below acts.
     It stops in front of the splat that would bring T below floor.
 
 `forward`           w = alpha T;  image += w c;  T <- T - w;  at the end image += T background, alpha plane = 1 - T.
 
-`backward`          given v_image = dloss/dimage and, for the alpha plane, v_alpha.  Back to front, T starts at the final T
-                    and R, the sum over the splats behind of w_j (v_image . c_j) plus the background's part, at
+`backward`          given v_image = dloss/dimage and, for the alpha plane, v_alpha.  Back to front; at first T is the
+                    final T, and R, the sum of w_j (v_image . c_j) over the splats behind with the background's part, is
                     T (v_image . background - v_alpha):
                     r = 1 / (1 - alpha);  T <- T r;  w = alpha T;  beta = alpha r;  e = v_image . c
                     s = w e - beta R, the derivative in q = ln alpha, 0 where 2^l > free;  R <- R + w e
@@ -39,15 +39,16 @@ from splat.model.settings import RenderSettings
 from splat.projection.whitening import Q0, QU, QUU, QUV, QV, QVV, ROUND
 
 SPLAT = 9  # numbers of a splat, of its tangent (six coefficients of q', colour'), and of its adjoint (six moments, G)
-WIDEN = 1e-4  # relative widening of an ellipse's level, so that no active pixel is missed
+WIDEN = 1e-4  # widening of an ellipse's level, relative and absolute, so that no active pixel is missed
 
-# The sums that make a splat's diagonal block (`render/cpu/blocks.py`): moments of its q q term to degree 4; from CROSS, for
-# each channel c, moments of w g_c + w h_c D_c to degree 2; from COLOUR, for each channel, the sum of w^2 h_c.
+# The sums that make a splat's diagonal block; g, h, the first and second derivatives of the image's loss, and D = dI / dq as
+# in `render/cpu/blocks.py`.  Moments of its q q term to degree 4; from CROSS, for each channel c, moments of w g_c + w h_c D_c
+# to degree 2; from COLOUR, for each channel, the sum of w^2 h_c.
 DEGREE4, DEGREE2 = 15, 6  # numbers of moments u^j v^k with j + k at most 4, and at most 2
 CROSS, COLOUR = DEGREE4, DEGREE4 + 3 * DEGREE2
 BLOCK_SUMS = COLOUR + 3
 
-LEAST_TRANSMITTANCE = {torch.float32: 1e-30, torch.float64: 1e-290}  # beneath it T would underflow
+LEAST_TRANSMITTANCE = {torch.float32: 1e-30, torch.float64: 1e-290}  # a pixel stops here, before T underflows
 LEAST_LOG2_ALPHA = {torch.float32: -126.0, torch.float64: -1022.0}  # the range of exp2
 
 
@@ -55,7 +56,7 @@ class Thresholds(NamedTuple):
     """Thresholds at which a splat is drawn and a pixel stops.
 
     alpha_min, alpha_max: bounds of alpha.  contour: largest distance from the mean, in standard deviations, or infinity.
-    least: smallest log2 alpha.  free: alpha above which derivatives in ln alpha are 0, or infinity.  floor: transmittance below
+    least: smallest log2 alpha.  free: 2^l above which derivatives in ln alpha are 0, or infinity.  floor: transmittance below
     which a pixel stops.
     """
 
@@ -162,7 +163,7 @@ def step_backward_tangent(tau, dR, dv_image, w, beta, rR, dq, v_image, colour, d
 
 @formula
 def row_terms(v, s, w, h):
-    """A row's terms s, s v, s v^2 and w h of the sums over rows; they depend on the column."""
+    """A row's terms s, s v, s v^2 and w h of the sums over rows, which each column has for itself."""
     sv = s * v
     return s, sv, sv * v, w * h[0], w * h[1], w * h[2]
 
@@ -180,10 +181,10 @@ def column_terms(columns, u):
 
 @formula
 def second_order(q, moments, total):
-    """Tangent of a splat's adjoint along the coefficients q, as six moments at the whitening W and opacity o before.
+    """Tangent of a splat's adjoint along the coefficients q, as six moments at the old whitening W and opacity o.
 
-    moments: of s; total: moments of s' at fixed offsets.  The other terms: offsets move with the mean, whose gradient is
-    sum s Q d; that of o is S / o.
+    moments: of s; total: moments of s' at fixed offsets.  The other terms: the offset d moves with the mean; and the gradients
+    sum s Q d of the mean and S / o of o change with Q and o.
     """
     S, Su, Sv = moments[0], moments[1], moments[2]
     u, v = q[QU] / ROUND, q[QV] / ROUND
@@ -220,7 +221,7 @@ def ellipse_of(splat, alpha_min, contour):
 
 @formula
 def pixels_within(centre, reach, size):
-    """First and last pixel index whose centre lies within reach, clipped to the image; empty if first > last."""
+    """First and last pixel index within reach of centre (in pixel indices), clipped to the image; empty if first > last."""
     first = ceil(min(max(centre - reach, 0.0), size))
     last = floor(max(min(centre + reach, size - 1.0), -1.0))
     return int(first), int(last)
@@ -305,13 +306,13 @@ BLOCK_INDEX, D2Q = _block_index(), _d2q()
 
 @formula
 def colour_slopes(free, beta, R, colour):
-    """D_c = dI_c / dq of the three channels; free, beta: w and beta where the cap does not hold, else 0."""
+    """D_c = dI_c / dq of the three channels; free, beta: w and beta where the cap does not hold, else 0; R: colour behind."""
     return free * colour[0] - beta * R[0], free * colour[1] - beta * R[1], free * colour[2] - beta * R[2]
 
 
 @formula
 def step_block(w, free, beta, R, g, h, colour):
-    """D (three channels), the colour R seen from in front of the splat, and its q q term; g, h: of the image's loss."""
+    """D (three channels), the colour R in front of the splat, and its q q term; g, h: dl/dI and the diagonal of l''."""
     D = colour_slopes(free, beta, R, colour)
     weight = D[0] * (g[0] + h[0] * D[0]) + D[1] * (g[1] + h[1] * D[1]) + D[2] * (g[2] + h[2] * D[2])
     return D, plus(R, w, colour), weight

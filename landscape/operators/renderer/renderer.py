@@ -44,7 +44,7 @@ TRIALS = 2  # renders that find a step
 FACTOR = 1e4  # the largest by which a trial changes h
 ROUNDING = 1 / 4  # mean error of a rounded number, in units of eps
 KEPT = 1 << 30  # bytes for J^T g of the first views; each other view costs one backward pass more in a product
-SEEN = 3  # times the noise: a smaller change of an image may be noise, by sqrt(2) of which two renders differ
+SEEN = 3  # times the noise: a smaller change of an image may be noise alone, as two renders differ by sqrt(2) times it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,7 +111,7 @@ class RendererHessian:
     render: from a view to its image, a tensor of any shape that depends on the parameters as they are at the call.
     parameters: the leaf tensors by name, of one type on one device; each is a block, in this order; neighbours whose names
         agree before a slash, as sh/dc and sh/rest, are one.
-    loss: from (image, view) to a tensor of one number, by torch operations that are differentiable twice in the image.
+    loss: from (image, view) to a scalar tensor, by torch operations that are differentiable twice in the image.
     views: two graphs at most are held, whatever their number.
     noise: standard deviation of the renderer's noise, relative to the image's root mean square; raised to what two renders of
         the first view show.

@@ -1,7 +1,7 @@
 """Row space of the Hessian in the SH coefficients of each Gaussian; `null_space.py` has the formulas.
 
 It is spanned by the harmonics Y(d_m) of the views m, for each channel that m does not clamp, and by at most three slopes
-sum_m a_mc dY(d_m)/dmu_j, vectors over all channels.  Mostly no channel is clamped, and the three share a basis of harmonics.
+sum_m a_mc dY(d_m)/dmu_j, vectors over all channels.  Mostly no channel is clamped, and the three channels share a basis.
 """
 
 from collections.abc import Iterable, Sequence
@@ -106,7 +106,8 @@ def _colours_of(
 ) -> ColourSpace:
     """The spaces of some Gaussians.  rows: harmonics, and which channels are not clamped; sizes: see `spanned`.
 
-    Harmonic spaces: one for channel 0 of every Gaussian; others for channels 1 and 2 only where other views clamp those.
+    Harmonic spaces: one for channel 0 of every Gaussian; others for channels 1 and 2 where not the same views clamp
+    them.
     """
     (harmonics, visible), n = rows.split([rows.shape[2] - 3, 3], dim=2), len(rows)
     everyone = torch.arange(n, device=rows.device)
@@ -117,7 +118,7 @@ def _colours_of(
         gaussian.append(other)
         weights.append(visible[other, :, c])
     spaces = row_space(harmonics[torch.cat(gaussian)] * torch.cat(weights)[:, :, None], tolerance)
-    # where harmonics are all of each channel's coefficients, slopes add nothing
+    # where harmonics span all coefficients of each channel, slopes add nothing
     some = torch.nonzero((spaces.rank[row] < harmonics.shape[2]).any(dim=1))[:, 0]
     colours = ColourSpace(spaces, row[some], RowSpace(slopes[some, :0], row.new_zeros(len(some))))
     added = spanned(colours.without(slopes[some]), sizes[some], tolerance)

@@ -1,7 +1,7 @@
 """Row spaces of many small matrices, one for each Gaussian, by their orthonormal bases.
 
 A basis is found by a singular value decomposition of the rows; directions with a singular value below TOLERANCE times the
-largest are null.
+largest, or times a given size, are null.
 """
 
 from collections.abc import Sequence
@@ -91,7 +91,7 @@ def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float
         for start in range(first, last, CHUNK):
             some = slice(start, min(start + CHUNK, last))
             part = rows[some]
-            if r < d:  # L Q = rows has their singular values and, turned by Q, their right vectors
+            if r < d:  # L of rows = L Q has their singular values; its right vectors times Q are theirs
                 part, Q = _gram_schmidt(part)
                 _, values[some], turned = torch.linalg.svd(part)
                 basis[some] = turned @ Q
