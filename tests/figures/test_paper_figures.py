@@ -214,7 +214,7 @@ def test_the_seeds_of_a_sweep_are_a_band_behind_the_index(runs):
         table[[name for name in table if name.startswith("eigenvalue_ratio")]] *= factor
         table.to_csv(other / "trajectory.csv", index=False)
     index = fig7.draw(runs).axes[0]
-    reached = [band.get_paths()[0].vertices[:, 1].max() for band in index.collections]
+    reached = [np.asarray(band.get_paths()[0].vertices)[:, 1].max() for band in index.collections]
     assert {80.0, 32.0} <= set(np.round(reached, 6)) and "bands: 2 seeds" in index.get_title()
 
 

@@ -19,10 +19,11 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from analysis.bench.stress import BACKGROUND, Case
-from splat.losses.reference import C1, C2, LossSettings, blur, pixel_loss
+from splat.losses.reference import C1, C2, LossSettings, blur
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import Splats, project
 from splat.render.reference import rasterize_reference
+from tests.splat.photometric import pixel_loss
 
 STEP, DRAWS = 1e-9, 6
 SAMPLING = sqrt(DRAWS / chi2.ppf(0.01, DRAWS))
@@ -45,7 +46,7 @@ def roundings(seed: int) -> Rounded:
 
 
 def specified_loss(image: Tensor, target: Tensor, loss: LossSettings, rounded: Rounded) -> Tensor:
-    """`losses.photometric_loss`, with `rounded` applied to the blurs and their arguments."""
+    """`photometric_loss`, with `rounded` applied to the blurs and their arguments."""
     value = loss.pixel_weight * pixel_loss(image, target, loss.pixel, loss.eps)
     if not loss.ssim_weight:
         return value
