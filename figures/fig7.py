@@ -127,9 +127,9 @@ def _seeds(axes: Axes, run: Path, name: str, colour: str) -> int:
     beside = sorted(run.parent.glob(f"*/{RECORDS}")) if name != run.name else [run / RECORDS]
     table = pd.concat(map(read_trajectory, beside), ignore_index=True)
     bounded = np.isfinite(table[["eigenvalue_ratio_low", "eigenvalue_ratio_high"]]).all(axis=1)
-    sizes = [(step, part["eigenvalue_ratio"].abs()) for step, part in pd.DataFrame(table[bounded]).groupby("step")]
-    low, high = ([float(end(size)) for _, size in sizes] for end in (np.min, np.max))
-    axes.fill_between([float(step) for step, _ in sizes], low, high, color=colour, alpha=0.15, linewidth=0)  # pyright: ignore
+    sizes = table[bounded].assign(eigenvalue_ratio=table["eigenvalue_ratio"].abs())
+    band = sizes.groupby("step")["eigenvalue_ratio"].agg(["min", "max"])
+    axes.fill_between(band.index, band["min"], band["max"], color=colour, alpha=0.15, linewidth=0)
     return len(beside)
 
 

@@ -167,9 +167,8 @@ def _write_pruned(folder: Path, checkpoint: Checkpoint) -> None:
     """Write the checkpoint, and its Gaussians as PLY."""
     save_checkpoint(folder / "checkpoint.pt", checkpoint.training, checkpoint.scene)
     file, _ = own_file(checkpoint)
-    (folder / "pruned.ply").write_bytes(
-        splat_ply(file.gaussians, tool=file.tool, antialiased=file.antialiased, train=file.train)
-    )
+    said = {"antialiased": file.antialiased, "train": file.train, "width": file.width}
+    (folder / "pruned.ply").write_bytes(splat_ply(file.gaussians, tool=file.tool, **said))
 
 
 def _curve(

@@ -19,8 +19,8 @@ smaller one elsewhere: the jump lies on the other side.
 **The step h.**  |.| is the root mean square, dI the image's change in a step.  Rounding the image, by u = eps / 4 of its size
 on average, makes a relative error u |I| / |dI| in J v.  Jumps make differences one-sided in pixels whose share grows with the
 step, an error like |dI| / |I|.  The two are equal at |dI| = sqrt(u) |I|.  The noise of a renderer that does not repeat itself
-takes the place of u where it is larger.  TRIALS renders find h, in the first view that v changes; each
-before it costs as many.
+takes the place of u where it is larger.  TRIALS renders find h, in the first view that v
+changes; each before it costs as many.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

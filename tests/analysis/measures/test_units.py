@@ -37,6 +37,8 @@ def test_a_scenes_size_is_its_depth_or_the_distance_of_its_cameras():
     around = objective_in_a_world(apart=2.5)
     first, second = (view.camera.centre for view in around.views)
     assert scene_size(around) == pytest.approx(float((first - second).norm()) / 2, rel=1e-12)
+    for apart, here in ((0.0, facing), (2.5, around)):  # in a world of other units as many of them
+        assert scene_size(objective_in_a_world(1.7, apart)) == pytest.approx(1.7 * scene_size(here), rel=1e-10)
 
 
 def test_behind_the_first_camera_there_is_no_depth():

@@ -23,8 +23,8 @@ probed, as in Eqs. (11) and (13), for renders of the probed copy from other pose
 The step counts as a constant, as in SAM: with Theta' = Theta + step (Eq. (14)), dTheta' / dTheta is the identity, except for
 quaternions: there it is right multiplication by exp(omega), an orthogonal matrix.
 
-rho of quats: tr(H_q) is per unit of a unit quaternion, which is two radians.  `rotation_unit` is that of
-c / (tau + eps); rho itself is in radians.
+rho of quats: tr(H_q) is per unit of a unit quaternion, which is two radians.  `rotation_unit` is that of c / (tau + eps);
+rho itself is in radians.
 """
 
 from collections.abc import Collection, Mapping, Sequence

@@ -51,6 +51,7 @@ def test_the_highest_scores_are_kept_in_both_files(curved, folder):
     assert len(before) - 1 not in chosen  # opaque, but no view sees it
     expected = before.select(torch.from_numpy(chosen))
     written = read_splats(curved / "pruned.ply")
+    assert written.width == 24  # of the pictures that it was trained on
     assert torch.equal(written.gaussians.flat, expected.flat) and written.tool == "splat-landscape"
     loaded = load_checkpoint(curved / "checkpoint.pt")
     assert torch.equal(loaded.training.gaussians.flat, expected.flat)
