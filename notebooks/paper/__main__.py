@@ -6,7 +6,7 @@ OUT/study.csv        the runs (`notebooks.paper.study`)
 OUT/claims.csv       the effects behind each verdict (`notebooks.paper.statements`)
 OUT/predictors.csv   rank correlation of quantities with the score (`notebooks.paper.predictors`)
 OUT/*.png, *.pdf     the figures, OUT/captions.md their captions and the ten verdicts (`notebooks.paper.figures`)
-OUT/prediction/      table, figure and caption of the prediction.csv beside the study (`notebooks.paper.prediction`)
+OUT/prediction/      tables, figures and page of the prediction.csv beside the study (`notebooks.paper.found`)
 
 `landscape sweep notebooks/study_small.toml; python -m notebooks.paper runs/study-small` repeats the stored results.
 """
@@ -23,13 +23,14 @@ from analysis.console.failures import program
 from analysis.console.plain import say
 from analysis.records.run_files import read_trajectory
 from figures.scripts import print_files
-from notebooks.paper import prediction
 from notebooks.paper.effects import UNTESTED
 from notebooks.paper.figures import RESULTS, make
+from notebooks.paper.found import make as write_found
 from notebooks.paper.predictors import predictors
 from notebooks.paper.statements import LEAST, Judgement, effect_table, judgements
 from notebooks.paper.study import study, unended
 from notebooks.paper.table import FILE
+from notebooks.prediction.answers import FILE as PREDICTION
 from splat.training.checkpoint import write_atomically
 
 STYLES = {"holds": "green", "holds in part": "yellow", "does not hold": "red"} | dict.fromkeys(
@@ -61,8 +62,8 @@ def _made(paths: Sequence[Path], out: Path):
         write_atomically(out / name, table.to_csv(index=False).encode())
         yield out / name
     yield from make(rows, found, related, out, read_trajectory(along) if along.is_file() else None)
-    if (stored := paths[0] / prediction.FILE).is_file():
-        yield from prediction.make(prediction.read_prediction(stored), out / "prediction")
+    if (stored := paths[0] / PREDICTION).is_file():
+        yield from write_found(stored, found, out / "prediction")
 
 
 def tell(rows: pd.DataFrame, found: Sequence[Judgement], console: Console) -> None:

@@ -18,59 +18,17 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from scipy.special import stdtrit
 
-from analysis.records.quantities import quantity
+from notebooks.statistics import Interval
 
 UNTESTED = "cannot be tested at this size"
 Verdict = Literal["holds", "holds in part", "does not hold", "undecided", "cannot be tested at this size"]
-LEAST, CONFIDENCE = 3, 0.95
+LEAST = 3
 BASE, STABLE = "3dgs", "stablegs"
 SCORE = "psnr"
 STRETCHED = ("quats", "log_scales")  # attributes whose curvature the paper ascribes to needles
 PAIR = ("scene", "seed")
 SURROUNDINGS = ("machine", "threads")  # columns that must agree for times to be compared
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A mean over n trainings or pairs with its 95% interval, unbounded for n below 2."""
-
-    value: float
-    low: float
-    high: float
-    n: int
-
-    @classmethod
-    def of(cls, values: Sequence[float] | pd.Series, pooled: tuple[float, int] | None = None) -> "Interval":
-        """The interval of the mean of all finite values.  pooled: their deviation and its degrees of freedom, where known.
-
-        >>> Interval.of([1.0, 2.0, 3.0])
-        Interval(value=2.0, low=-0.484..., high=4.484..., n=3)
-        """
-        known = np.asarray(values, float)
-        known = known[np.isfinite(known)]
-        n = len(known)
-        if n < 2:
-            return cls(float(known.mean()) if n else np.nan, -np.inf, np.inf, n)
-        deviation, freedom = pooled or (float(known.std(ddof=1)), n - 1)
-        half = float(stdtrit(freedom, (1 + CONFIDENCE) / 2) * deviation / np.sqrt(n))
-        return cls(float(known.mean()), float(known.mean()) - half, float(known.mean()) + half, n)
-
-    def exp(self) -> "Interval":
-        """The interval of a ratio, from that of its logarithm."""
-        value, low, high = (float(np.exp(x)) for x in (self.value, self.low, self.high))
-        return Interval(value, low, high, self.n)
-
-    def text(self, unit: str = "") -> str:
-        """Value, interval and n in words.
-
-        >>> Interval(1.5, 1.0, 2.0, 3).text(" dB")
-        '1.50 dB (1.00 to 2.00; n = 3)'
-        """
-        if self.n < 2:
-            return f"{quantity(self.value)}{unit} (n = 1)" if self.n else "not measured"
-        return f"{quantity(self.value)}{unit} ({quantity(self.low)} to {quantity(self.high)}; n = {self.n})"
 
 
 @dataclass(frozen=True)

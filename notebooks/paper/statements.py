@@ -32,7 +32,7 @@ from notebooks.paper.effects import (
 RIVAL = "dropgaussian"
 ATTRIBUTES_ALONE, VIEWPOINTS_ALONE = "stablegs vsp_weight=0", "stablegs asp_weight=0"
 AXIS = ATTRIBUTES_ALONE + " probe.attributes={}"
-TIME = 1.45  # largest ratio of times that agrees with the paper's 1.3
+CLAIMED_TIME, TIME = 1.3, 1.45  # the paper's, and the largest ratio of times that agrees with it
 CLAIMED_VIEWS = 3  # training views of the claimed gains in dB
 SUFFICIENT = 0.1  # relative standard error of a trace, and so 5% of its square root rho
 
@@ -172,7 +172,8 @@ def basin(rows: pd.DataFrame) -> Judgement:
 def cost(rows: pd.DataFrame) -> Judgement:
     names = {STABLE: "a viewpoint for each view", f"{STABLE} viewpoints=one": "one viewpoint"}
     effects = [
-        ratio_effect(f"time, {words}", log_ratios(rows, "cpu_seconds", name), None) for name, words in names.items()
+        ratio_effect(f"time, {words}", log_ratios(rows, "cpu_seconds", name), CLAIMED_TIME)
+        for name, words in names.items()
     ]
     every, one = (_within(effect.interval) for effect in effects)
     tested = min(effect.interval.n for effect in effects) >= LEAST

@@ -17,9 +17,10 @@ from analysis.runs.sweep.sweep_file import read_sweep
 from notebooks.paper.__main__ import main
 from notebooks.paper.effects import UNTESTED, Interval, gain, gains, log_ratios
 from notebooks.paper.figures import ONLY
-from notebooks.paper.predictors import DRAWS, predictors
+from notebooks.paper.predictors import predictors
 from notebooks.paper.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, judgements
 from notebooks.paper.study import _hutchinson, _more, _runs, method_name, study, unended
+from notebooks.statistics import DRAWS
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
 from splat.training.start import Source

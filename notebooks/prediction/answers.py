@@ -1,7 +1,7 @@
 """Which measure goes with the views that were held out, beyond training PSNR and ln N: the answer of prediction.csv.
 
 tau         Kendall's, of measure and PSNR of the held-out views given the controls, within each scene; the mean over the scenes
-            with its interval of 95% by the jackknife over cells and scenes (`notebooks.paper.predictors`)
+            with its interval of 95% by the jackknife over cells and scenes (`notebooks.statistics`)
 holm        p after Holm's correction for the measures without the bars, at one time
 alike       scenes, of scenes, whose own tau has the sign of the mean
 agreement   share of the pairs of trainings that the measure orders as tau says, the least over PAIRS.  Of the fraction of
@@ -9,7 +9,8 @@ agreement   share of the pairs of trainings that the measure orders as tau says,
 gain        of R^2 in a scene left out, over that of the controls: least squares on ranks within the scenes
 tau_SCENE   of a scene's trainings alone
 answer      "predicts": the interval has no 0, p < 0.05 after Holm, |tau| >= LARGE, and one sign in five of six scenes; "does
-            not": the interval lies inside +-SMALL; else "undecided".  "not yet": fewer trainings than ENOUGH have ended
+            not": the interval lies inside +-SMALL; else "undecided", as with fewer than five scenes.  "not yet": fewer
+            trainings than ENOUGH have ended
 
 A scene counts from LEAST trainings with the measure on.  Left out, and counted in `left_out`, are trainings whose PSNR on the
 training views ends below COLLAPSED; `missing` counts those that were never as good as the level.
@@ -25,8 +26,8 @@ from scipy.stats import rankdata
 
 from figures.style import BLUE, GREEN, MISSING, UNDETERMINED, VERMILION, new_figure, save, style
 from landscape.errors import InputError
-from notebooks.paper.effect_figures import words_of
-from notebooks.paper.predictors import holm, interval, jackknife
+from notebooks.statistics import LEAST as FEWEST_SCENES
+from notebooks.statistics import digits, holm, interval, interval_text, jackknife
 from splat.model.untrusted import read_table, write_atomically
 
 FILE = "prediction.csv"
@@ -36,10 +37,15 @@ FINITE = ("order_fragility", "field_sharpness", "critical_sharpness")
 UNSEEN = ("open_curvature", "order_fragility_new", "field_sharpness_new")
 BARS = ("coadaptation", "ensemble")
 MEASURES = INFINITESIMAL + FINITE + UNSEEN + BARS
-COLOURS = dict.fromkeys(INFINITESIMAL, BLUE) | dict.fromkeys(FINITE, VERMILION) | dict.fromkeys(UNSEEN, GREEN)
+COLOURS: dict[str, str] = {
+    name: colour for names, colour in ((INFINITESIMAL, BLUE), (FINITE, VERMILION), (UNSEEN, GREEN)) for name in names
+}
+TIMES = {"30": "at 30 dB", "end": "at the end"}  # the answers that were planned; few reach 33 and 36 dB in five scenes
 PAIRS = ("ab", "ad", "bd", "cf", "eg")
 LARGE, SMALL, COLLAPSED, ENOUGH, LEAST = 0.2, 0.25, 20.0, 400, 12
 ROW = 0.19  # inches
+WORDS = {"trace_means": "trace of position", "lambda_max": "λ max", "eigenvalue_ratio": "λ max / λ min"}
+WORDS |= {"coadaptation": "co-adaptation", "ensemble": "difference of seeds"}
 COLUMNS = (
     "at", "measure", "tau", "low", "high", "p", "holm", "alike", "scenes", "agreement", "pair", "gain", "n", "missing",
     "left_out", "answer",
@@ -79,16 +85,16 @@ def answer(line: dict, trainings: int) -> str:
     """The criteria that were fixed beforehand, on one row of `answers`."""
     if trainings < ENOUGH:
         return "not yet"
+    if line["scenes"] < FEWEST_SCENES:
+        return "undecided"
     apart = (line["low"] > 0 or line["high"] < 0) and not line["holm"] >= 0.05  # bars have no p of Holm's
     if apart and abs(line["tau"]) >= LARGE and 6 * line["alike"] >= 5 * line["scenes"]:
         return "predicts"
     return "does not" if max(abs(line["low"]), abs(line["high"])) < SMALL else "undecided"
 
 
-def make(rows: pd.DataFrame, out: Path) -> Iterator[Path]:
-    """Write caption, and from ENOUGH trainings on table and figure, none before; gives each file when it is there."""
-    enough = sum(rows["at"] == "end") >= ENOUGH
-    found = answers(rows) if enough else pd.DataFrame()
+def write_answers(rows: pd.DataFrame, found: pd.DataFrame, out: Path) -> Iterator[Path]:
+    """Write caption, and where something is found table and figure; gives each file when it is there."""
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / "caption.md", f"{caption(rows, found)}\n".encode())
     yield out / "caption.md"
@@ -189,12 +195,24 @@ def caption(rows: pd.DataFrame, table: pd.DataFrame) -> str:
     ended = sum(rows["at"] == "end")
     scenes = len({*rows["scene"]})
     words = f"{ended} trainings of {scenes} scene{'s' * (scenes != 1)}"
-    if ended < ENOUGH:
-        return f"{words}; before {ENOUGH} nothing is answered."
-    told = [f"{at if at == 'end' else at + ' dB'}: {name_of(name)}" for at, name in zip(table["at"], table["measure"])]
-    answered = pd.Series(told).groupby(table["answer"].to_numpy()).agg(", ".join)
-    said = [f"{answer}: {each}" for answer, each in answered.items()]
-    return f"{words}. {'; '.join(said)}."
+    return f"{words}: {summary(table)}" if ended >= ENOUGH else f"{words}; before {ENOUGH} nothing is answered."
+
+
+def summary(table: pd.DataFrame) -> str:
+    """The answers of TIMES, and the smallest p of each."""
+    said = []
+    for at, words in TIMES.items():
+        judged = pd.DataFrame(table[(table["at"] == at) & ~table["measure"].isin(BARS)])
+        if not len(judged):
+            continue
+        named = {answer: ", ".join(map(name_of, part["measure"])) for answer, part in judged.groupby("answer")}
+        best = judged.sort_values("p").iloc[0].to_dict()
+        said.append(
+            f"{words} {named.get('predicts', 'none')} of {len(judged)} predicts PSNR on held-out views, "
+            f"{named.get('does not', 'none')} is known not to (smallest p: {name_of(best['measure'])}, tau "
+            f"{interval_text(best, 'tau', '.2f')}, p after Holm's correction {digits(best['holm'])})"
+        )
+    return "; ".join(said) + "."
 
 
 def name_of(measure: str) -> str:
@@ -203,4 +221,5 @@ def name_of(measure: str) -> str:
     >>> name_of("trace_means"), name_of("order_fragility_new")
     ('trace of position', 'order fragility, new poses')
     """
-    return words_of(measure.removesuffix("_new")) + ", new poses" * measure.endswith("_new")
+    name = measure.removesuffix("_new")
+    return WORDS.get(name, name.replace("_", " ")) + ", new poses" * measure.endswith("_new")
