@@ -4,66 +4,73 @@ import textwrap
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from analysis.records.findings import attribute_name
 from figures.style import BLUE, UNDETERMINED, VERMILION, new_figure, style
 from notebooks.paper.effects import UNTESTED
+from notebooks.statistics import digits, interval_text
 
-UNITS = {"×": "ratio (×)", "dB": "PSNR gained (dB)", "": "share or correlation"}
 GIVEN, SIGNIFICANT = "given training PSNR, ln N", 0.05
 KINDS = {"all": "all runs", "given": GIVEN, "within": "seeds of a method"}
 VERDICTS = {"holds": BLUE, "holds in part": BLUE, "does not hold": VERMILION} | dict.fromkeys(
     ("undecided", UNTESTED), UNDETERMINED
 )
-ROW, PANEL, WRAP = 0.17, 1.05, 76  # inches; characters
-CROWDED = 1e3  # from the least ratio to the largest: powers of ten alone are labelled
-FAR = 1e4  # a ratio beyond this, or below its inverse, ends at the edge
+ROW, CLAIM, WRAP = 0.17, 0.36, 52  # inches; characters
+EDGES = -1.2, 2.2  # of the claims: what lies beyond is drawn at the edge
 
 
 def draw_claims(table: pd.DataFrame) -> Figure:
-    """A panel for each statement, under its verdict; a row for each of its effects."""
-    parts = [pd.DataFrame(part) for _, part in table.fillna({"unit": ""}).groupby("statement")]
+    """A row for each statement, under its verdict's colour: its first effect as a share of the paper's, with what was measured.
+
+    0: no effect, or the bound; 1: the paper's number; of ratios their logarithms.  An effect without a number in the paper is
+    told in words alone; one training has no interval and a hollow dot.
+    """
+    firsts = [part.iloc[0].to_dict() for _, part in table.fillna({"unit": ""}).groupby("statement")]
     with style():
-        figure = new_figure(sum(PANEL + ROW * len(part) for part in parts), 6.8)
-        panels = figure.subplots(len(parts), 1, squeeze=False, height_ratios=[len(part) + 2 for part in parts])[:, 0]
-        for axes, part in zip(panels, parts, strict=True):
-            _effects(axes, part)
-        words = "dot: measured, with its 95% interval; diamond: the paper; upright line: no effect, or the bound"
-        figure.supxlabel(words, fontsize=6.5)
+        figure = new_figure(0.8 + CLAIM * len(firsts), 6.8)
+        axes = figure.add_subplot()
+        for place, line in zip(range(len(firsts))[::-1], firsts):
+            colour = VERDICTS[line["verdict"]]
+            shares = np.clip([_share(line, name) for name in ("value", "low", "high")], *EDGES)
+            if np.isfinite(shares[0]):
+                axes.hlines(place, *np.sort(shares[1:]), color=colour, linewidth=1.2, clip_on=False)
+                axes.plot(
+                    shares[0],
+                    place,
+                    "o",
+                    color=colour,
+                    markerfacecolor=colour if line["n"] > 1 else "white",
+                    markersize=4,
+                    clip_on=False,
+                )
+            axes.annotate(_measured(line), (1.01, place), xycoords=("axes fraction", "data"), color=colour, va="center")
+        for place, words in {0: "no effect", 1: "the paper"}.items():
+            axes.axvline(place, color="0.5", linewidth=0.6)
+            axes.annotate(words, (place, 1.01), xycoords=("data", "axes fraction"), ha="center")
+        names = [textwrap.fill(f"{line['statement']}. {line['text']}", WRAP) for line in firsts]
+        axes.set_yticks(range(len(firsts))[::-1], names)
+        axes.set(xlim=EDGES, ylim=(-0.6, len(firsts) - 0.4))
+        axes.set_xlabel("effect over the paper's; intervals of 95%, at the edge where they are longer")
+        axes.grid(True, axis="x")
     return figure
 
 
-def _effects(axes: Axes, part: pd.DataFrame) -> None:
-    """Effects of one statement, or words where there is none.  Hollow: of a single training, which has no interval."""
-    places, unit, verdict = np.arange(len(part))[::-1], part["unit"].iloc[0], part["verdict"].iloc[0]
-    value, low, high, claimed = (part[name].to_numpy(float) for name in ("value", "low", "high", "claimed"))
-    several = part["n"].to_numpy() >= 2
-    if unit == "×":
-        axes.set_xscale("log")
-        ends = np.concatenate([x[np.isfinite(x) & (x > 0)] for x in (value, low, high, claimed)])
-        wide = ends.size and ends.max() > CROWDED * ends.min()
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0), numticks=8))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        value, low, high = (np.clip(x, 1 / FAR, FAR) for x in (value, low, high))
-    axes.hlines(places[several], low[several], high[several], color=BLUE, linewidth=1.2)
-    for chosen, face in ((several, BLUE), (~several, "white")):
-        axes.plot(value[chosen], places[chosen], "o", color=BLUE, markerfacecolor=face, markersize=3.5)
-    axes.plot(claimed, places, "D", color=VERMILION, markersize=3.5, markerfacecolor="white")
-    axes.plot(part["null"], places, "|", color="0.5", markersize=8)
-    for place, n in zip(places, part["n"]):
-        if n < 2:
-            words = "one training" if n else "not measured"
-            axes.annotate(words, (1.01, place), xycoords=("axes fraction", "data"), color=UNDETERMINED, va="center")
-    axes.set_yticks(places, list(part["effect"]))
-    axes.set_ylim(-0.7, len(part) - 0.3)
-    axes.set_xlabel(UNITS[unit])
-    statement = textwrap.fill(f"{part['statement'].iloc[0]}. {part['text'].iloc[0]}", WRAP)
-    axes.set_title(f"{statement}\n{verdict}", loc="left", color=VERDICTS[verdict])
-    axes.grid(True, axis="x")
+def _share(line: dict, name: str) -> float:
+    """Where a number of an effect lies from no effect, 0, to the paper's, 1; nan without a number in the paper."""
+    value, null, claimed = (line[key] for key in (name, "null", "claimed"))
+    if line["unit"] == "×":
+        value, null, claimed = (np.log(max(each, 0.0) or np.nan) for each in (value, null, claimed))
+    return (value - null) / (claimed - null) if claimed != null else np.nan
+
+
+def _measured(line: dict) -> str:
+    """The effect in its own unit and its verdict, two lines."""
+    if not line["n"]:
+        return "not measured"
+    form = "+.2f" if line["unit"] == "dB" else ""
+    found = interval_text(line, "value", form, f" {line['unit']}".rstrip()) if line["n"] > 1 else digits(line["value"])
+    return f"{found}\n{line['verdict']}"
 
 
 WORDS = {  # of quantities whose names do not say it

@@ -148,7 +148,8 @@ def samples(rows: pd.DataFrame) -> Judgement:
             f"{bound.interval.text()} ({bound.name.split(',')[0]})" for bound in bounds
         )
         finding += f"; {SUFFICIENT:.0%} counts as sufficient."
-    effects = [*least, *most] or [Effect("largest relative error of a trace", Interval.of([]), SUFFICIENT, 0.0)]
+    effects = sorted(most, key=lambda effect: -effect.interval.value) + least  # the largest bound first
+    effects = effects or [Effect("largest relative error of a trace", Interval.of([]), SUFFICIENT, 0.0)]
     return Judgement(6, "Ten random probes suffice for the traces.", "Eq. (6)", verdict, finding, tuple(effects))
 
 
