@@ -12,11 +12,14 @@ import pandas as pd
 from figures.style import save
 from notebooks.paper.effects import Effect
 from notebooks.paper.statements import Judgement
-from notebooks.prediction import answers as of
 from notebooks.prediction.answers import (
     BARS,
+    COLLAPSED,
+    ENOUGH,
+    LARGE,
     MEASURES,
     SCORE,
+    SMALL,
     TIMES,
     answers,
     name_of,
@@ -50,7 +53,9 @@ two.  A measure *predicts* if the interval has no 0, p after Holm's correction i
 one sign is found in five of six scenes; it *does not* if the interval lies within ±{small}.  These criteria were fixed
 before the first training.  The last two rows have no curvature in them: co-adaptation, how much renders of random halves of
 the Gaussians differ, and the difference of trainings that differ in their seed.  They are bars for the others, without a
-correction.  [The pictures](what_predicts.ipynb)."""
+correction.  *Least agreement*: of pairs of trainings that differ in two switches, the share that the measure orders as its
+tau says, for the switches where it is least; 50% is chance.  *R² gained*: in predicting the ranks of a scene from those of
+the others.  [The pictures](what_predicts.ipynb)."""
 
 EFFECTS = """## What do the switches do?
 
@@ -79,9 +84,9 @@ LIMITS = """## Limits, and what differs from the plan
 
 
 def make(stored: Path, found: Sequence[Judgement], out: Path) -> Iterator[Path]:
-    """Write what a prediction.csv answers, and from of.ENOUGH trainings on its page; gives each file when it is there."""
+    """Write what a prediction.csv answers, and from ENOUGH trainings on its page; gives each file when it is there."""
     rows = read_prediction(stored)
-    enough = sum(rows["at"] == "end") >= of.ENOUGH
+    enough = sum(rows["at"] == "end") >= ENOUGH
     answered = answers(rows) if enough else pd.DataFrame()
     yield from write_answers(rows, answered, out)
     if enough:
@@ -109,7 +114,7 @@ def page(
     counts = _counts(rows)
     parts = [
         HEAD, lines(rows, answered, switched, found), PREDICTS.format(**counts),
-        "\n".join(_answered(answered)), _filled(told(shuffled)), EFFECTS, "\n".join(_switched(switched)),
+        "\n".join(_answered(answered)).rstrip(), _filled(told(shuffled)), EFFECTS, "\n".join(_switched(switched)),
         STATEMENTS, "\n".join(_judged(found)), "\n".join(_filled(each.finding, f"{each.number}. ") for each in found),
         LIMITS.format(**counts),
     ]  # fmt: skip
@@ -148,38 +153,30 @@ def lines(rows: pd.DataFrame, answered: pd.DataFrame, switched: pd.DataFrame, fo
 
 def _counts(rows: pd.DataFrame) -> dict[str, object]:
     ends = pd.DataFrame(rows[rows["at"] == "end"])
-    collapsed = ends[ends["psnr_train"] < of.COLLAPSED]
+    collapsed = ends[ends["psnr_train"] < COLLAPSED]
     missed = (rows["at"] == "30").to_numpy() & ~rows["reached"].to_numpy(bool)
     return {
         "ended": len(ends), "planned": PLANNED, "scenes": len({*rows["scene"]}), "seeds": len({*ends["seed"]}),
-        "missing": int(missed.sum()), "large": of.LARGE, "small": of.SMALL,
-        "left_out": len(collapsed), "collapsed": f"{of.COLLAPSED:g}", "ensemble": len(ends.dropna(subset="ensemble")),
+        "missing": int(missed.sum()), "large": LARGE, "small": SMALL,
+        "left_out": len(collapsed), "collapsed": f"{COLLAPSED:g}", "ensemble": len(ends.dropna(subset="ensemble")),
         "collapsed_scenes": " and ".join(sorted({*collapsed["scene"]})),
     }  # fmt: skip
 
 
 def _answered(answered: pd.DataFrame) -> Iterator[str]:
-    yield (
-        "| measure | "
-        + " | ".join(f"{words}: tau | p, Holm | scenes alike | answer" for words in TIMES.values())
-        + " |"
-    )
-    yield "| --- |" + " --- |" * 4 * len(TIMES)
-    by_place = {(line["measure"], line["at"]): line for line in answered.to_dict("records")}
-    for name in MEASURES:
-        cells = []
-        for at in TIMES:
-            if line := by_place.get((name, at)):
+    """A table for each of TIMES."""
+    for at, when in TIMES.items():
+        yield f"| {when} | tau | p, Holm | scenes alike | least agreement | R² gained | answer |"
+        yield "| --- |" + " --- |" * 6
+        lines = {line["measure"]: line for line in answered.to_dict("records") if line["at"] == at}
+        for name in MEASURES:
+            cells = ["too few"] + [""] * 5
+            if line := lines.get(name):
                 holm = "" if name in BARS else digits(line["holm"])
-                cells += [
-                    interval_text(line, "tau", ".2f"),
-                    holm,
-                    f"{line['alike']} of {line['scenes']}",
-                    line["answer"],
-                ]
-            else:
-                cells += ["too few", "", "", ""]
-        yield f"| {name_of(name)} | {' | '.join(cells)} |"
+                cells = [interval_text(line, "tau", ".2f"), holm, f"{line['alike']} of {line['scenes']}",
+                         f"{line['agreement']:.0%}", f"{line['gain']:+.2f}".replace("-", "−").replace("+nan", ""), line["answer"]]  # fmt: skip
+            yield f"| {name_of(name)} | {' | '.join(cells)} |"
+        yield ""
 
 
 def _switched(switched: pd.DataFrame) -> Iterator[str]:
