@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from figures.style import save
@@ -172,9 +173,15 @@ def _answered(answered: pd.DataFrame) -> Iterator[str]:
         for name in MEASURES:
             cells = ["too few"] + [""] * 5
             if line := lines.get(name):
-                holm = "" if name in BARS else digits(line["holm"])
-                cells = [interval_text(line, "tau", ".2f"), holm, f"{line['alike']} of {line['scenes']}",
-                         f"{line['agreement']:.0%}", f"{line['gain']:+.2f}".replace("-", "−").replace("+nan", ""), line["answer"]]  # fmt: skip
+                gain = "" if np.isnan(line["gain"]) else f"{line['gain']:+.2f}".replace("-", "−")
+                cells = [
+                    interval_text(line, "tau", ".2f"),
+                    "" if name in BARS else digits(line["holm"]),
+                    f"{line['alike']} of {line['scenes']}",
+                    f"{line['agreement']:.0%}",
+                    gain,
+                    line["answer"],
+                ]
             yield f"| {name_of(name)} | {' | '.join(cells)} |"
         yield ""
 
