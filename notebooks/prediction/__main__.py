@@ -11,7 +11,8 @@ RUNS    folder of the sweep; of every training that has ended, RUNS/SCENE/CELL/S
     digest, scene_digest       of the checkpoint's Gaussians, and of its views
     commit, date, seconds      of the code, of the measuring, of the processor
 
-The table is written after each row, and what it has is not measured again.  `OMP_NUM_THREADS=1` keeps to one processor.
+The table is written after each row.  What it has is measured again only where the training was made again.
+`OMP_NUM_THREADS=1` keeps to one processor.
 
     landscape sweep notebooks/prediction.toml; python -m notebooks.prediction runs/prediction
 
@@ -34,6 +35,7 @@ from analysis.train.command import REACHED
 from landscape.errors import InputError
 from notebooks.prediction.rows import Row, ensemble_columns, measured_row
 from splat.model.untrusted import read_table, write_atomically
+from splat.training.checkpoint import load_checkpoint
 
 RESULTS = Path(__file__).parents[1] / "results" / "prediction.csv"
 END, LEVELS = "end", (30.0, 33.0, 36.0)  # as the sweep's save_at_psnr
@@ -66,6 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for key, path in found.items():
         begun = process_time()
         row: Row | None = rows.get(key)
+        if row and str(row["digest"]) != (load_checkpoint(path).state if path else "nan"):
+            row = None  # the training was made again
         others = [other for seed, other in _seeds(options.runs, key, path).items() if seed != key[2]]
         if row is None:
             row = Row(zip(COLUMNS[:4], key, strict=True)) | {"reached": path is not None, "seconds": 0.0}

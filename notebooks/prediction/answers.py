@@ -206,11 +206,12 @@ def summary(table: pd.DataFrame) -> str:
         if not len(judged):
             continue
         named = {answer: ", ".join(map(name_of, part["measure"])) for answer, part in judged.groupby("answer")}
-        best = judged.sort_values("p").iloc[0].to_dict()
+        best, undecided = judged.sort_values("p").iloc[0].to_dict(), list(judged["answer"]).count("undecided")
+        tau = f"tau {interval_text(best, 'tau', '.2f')}, p after Holm's correction {digits(best['holm'])}"
         said.append(
             f"{words} {named.get('predicts', 'none')} of {len(judged)} predicts PSNR on held-out views, "
-            f"{named.get('does not', 'none')} is known not to (smallest p: {name_of(best['measure'])}, tau "
-            f"{interval_text(best, 'tau', '.2f')}, p after Holm's correction {digits(best['holm'])})"
+            f"{named.get('does not', 'none')} is known not to, {undecided} are undecided (smallest p: "
+            f"{name_of(best['measure'])}, {tau})"
         )
     return "; ".join(said) + "."
 

@@ -87,6 +87,13 @@ def test_the_table_has_each_row_once_and_is_continued(tmp_path, monkeypatch):
     again = {row["at"]: row for row in table if row["seed"] == 0}
     assert all(again[at][name] == first[at][name] for at in ("end", "1") for name in ("lambda_max", "digest"))
 
+    out.write_text(out.read_text().replace(first["end"]["digest"], "0" * 16))  # as if the training had been made again
+    assert command.main([str(runs), "--out", str(out)]) == 0
+    made_again = {row["at"]: row for row in rows_of(out) if row["seed"] == 0}["end"]
+    assert len(paths) > 4 and all(
+        made_again[name] == again["end"][name] for name in ("digest", "lambda_max", "ensemble")
+    )
+
 
 def test_the_levels_are_those_of_the_sweep():
     sweep = read_sweep(command.RESULTS.parents[1] / "prediction.toml")
