@@ -143,7 +143,7 @@ def lines(rows: pd.DataFrame, answered: pd.DataFrame, switched: pd.DataFrame, fo
 
     return "\n".join(_filled(line, "- ") for line in (
         f"{_counts(rows)['ended']} trainings of 3DGS with seven switches in {_counts(rows)['scenes']} scenes, measures "
-        f"of the landscape given training PSNR and the number of Gaussians: {summary(answered)}",
+        f"of the landscape beyond training PSNR and the number of Gaussians: {summary(answered)}",
         f"StableGS's attribute probes change {changes(PROBES)}",
         f"Dropping a fifth of the Gaussians in each step changes {changes(DROPPED)}",
         f"Whole StableGS gains {_interval(gain)} on fern, in the paper {gain.claimed}; it takes {_interval(time)} the "

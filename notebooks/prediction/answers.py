@@ -40,6 +40,7 @@ MEASURES = INFINITESIMAL + FINITE + UNSEEN + BARS
 COLOURS: dict[str, str] = {
     name: colour for names, colour in ((INFINITESIMAL, BLUE), (FINITE, VERMILION), (UNSEEN, GREEN)) for name in names
 }
+ANSWERS = ("predicts", "does not", "undecided")
 TIMES = {"30": "at 30 dB", "end": "at the end"}  # the answers that were planned; few reach 33 and 36 dB in five scenes
 PAIRS = ("ab", "ad", "bd", "cf", "eg")
 LARGE, SMALL, COLLAPSED, ENOUGH, LEAST = 0.2, 0.25, 20.0, 400, 12
@@ -199,21 +200,27 @@ def caption(rows: pd.DataFrame, table: pd.DataFrame) -> str:
 
 
 def summary(table: pd.DataFrame) -> str:
-    """The answers of TIMES, and the smallest p of each."""
-    said = []
+    """The answers of TIMES in a sentence, and the smallest p."""
+    judged = pd.DataFrame(table[table["at"].isin([*TIMES]) & ~table["measure"].isin(BARS)])
+    said: dict[str, list[str]] = {}
     for at, words in TIMES.items():
-        judged = pd.DataFrame(table[(table["at"] == at) & ~table["measure"].isin(BARS)])
-        if not len(judged):
-            continue
-        named = {answer: ", ".join(map(name_of, part["measure"])) for answer, part in judged.groupby("answer")}
-        best, undecided = judged.sort_values("p").iloc[0].to_dict(), list(judged["answer"]).count("undecided")
-        tau = f"tau {interval_text(best, 'tau', '.2f')}, p after Holm's correction {digits(best['holm'])}"
-        said.append(
-            f"{words} {named.get('predicts', 'none')} of {len(judged)} predicts PSNR on held-out views, "
-            f"{named.get('does not', 'none')} is known not to, {undecided} are undecided (smallest p: "
-            f"{name_of(best['measure'])}, {tau})"
-        )
-    return "; ".join(said) + "."
+        if part := [line for line in judged.to_dict("records") if line["at"] == at]:
+            named = {
+                answer: [name_of(line["measure"]) for line in part if line["answer"] == answer] for answer in ANSWERS
+            }
+            predicts, does_not = (", ".join(named[answer]) or "none" for answer in ANSWERS[:2])
+            answered = f"{predicts} of {len(part)} predicts PSNR on held-out views, {does_not} is known not to"
+            said.setdefault(f"{answered}, {len(named['undecided'])} are undecided", []).append(words)
+    best = judged.sort_values("holm").iloc[0].to_dict()
+    nearest = f"{name_of(best['measure'])}, {TIMES[best['at']]}: tau {interval_text(best, 'tau', '.2f')}"
+    answered = "; ".join(f"{' and '.join(times)} {words}" for words, times in said.items())
+    words = f"{answered}.  Nearest to it is {nearest}, p {digits(best['holm'])} after Holm's correction."
+    bars = [
+        f"{name_of(line['measure'])} {TIMES[line['at']]} (tau {interval_text(line, 'tau', '.2f')})"
+        for line in table.to_dict("records")
+        if line["measure"] in BARS and line["answer"] == "predicts" and line["at"] in TIMES
+    ]
+    return f"{words}  What has no curvature in it, uncorrected: {', '.join(bars) or 'nothing'} predicts."
 
 
 def name_of(measure: str) -> str:
