@@ -72,14 +72,13 @@ the first effect that decides; the sentence after it has the others.  Why one ra
 
 LIMITS = """## Limits, and what differs from the plan
 
-- {ended} of {planned} trainings; the others are of the second and third seeds.  The difference of seeds is known where two
-  seeds were measured, of {ensemble}.
+- {ended} of {planned} trainings; second and third seeds are missing.  The difference of seeds is known of {ensemble} of them.
 - {left_out} trainings below {collapsed} dB on their training views are left out, all in {collapsed_scenes}.
 - Intervals are the jackknife's over cells and scenes, with Student's t of one degree of freedom less than there are scenes,
   in place of a bootstrap; what they do on shuffled scores is said above.
 - No two of the 32 cells differ in one switch alone: the agreement of pairs is that of pairs that differ in two.
-- 30 dB is reached by some cells of a scene and not by others, so that fewer trainings answer there; 33 and 36 dB by too
-  few.
+- 30 dB is reached by some cells of a scene and not by others, so that fewer trainings answer there; 33 and 36 dB are
+  reached in too few scenes.
 - Pictures are small and trainings short.  The check at 252 x 189 and at full size has not been run, nor have the trainings
   with viewpoint probes, SAM and FASR on these scenes: of StableGS the attribute probes alone are a switch."""
 
