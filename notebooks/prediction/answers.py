@@ -220,7 +220,7 @@ def summary(table: pd.DataFrame) -> str:
         for line in table.to_dict("records")
         if line["measure"] in BARS and line["answer"] == "predicts" and line["at"] in TIMES
     ]
-    return f"{words}  What has no curvature in it, uncorrected: {', '.join(bars) or 'nothing'} predicts."
+    return f"{words}  What has no curvature in it and predicts, uncorrected: {', '.join(bars) or 'nothing'}."
 
 
 def name_of(measure: str) -> str:
