@@ -73,10 +73,10 @@ def interval(tau: float, error: float, clusters: int) -> dict[str, float]:
     return {"low": max(tau - half, -1.0), "high": min(tau + half, 1.0), "p": p}
 
 
-def interval_text(line: dict, name: str, form: str, words: str = "") -> str:
+def interval_text(line: dict, name: str, form: str = "", words: str = "", after: str = "") -> str:
     """A number of a row and the ends of its interval, "low" and "high".  form: of Python; without one two digits."""
     value, low, high = (format(line[key], form) if form else digits(line[key]) for key in (name, "low", "high"))
-    return f"{value}{words} ({low} to {high})".replace("-", "−")
+    return f"{value}{words} ({low} to {high}{after})".replace("-", "−")
 
 
 def digits(value: float) -> str:

@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from analysis.records.findings import attribute_name
 from figures.style import BLUE, UNDETERMINED, VERMILION, new_figure, style
+from notebooks.names import words_of
 from notebooks.paper.effects import UNTESTED
 from notebooks.statistics import digits, interval_text
 
@@ -73,22 +73,6 @@ def _measured(line: dict) -> str:
     return f"{found}\n{line['verdict']}"
 
 
-WORDS = {  # of quantities whose names do not say it
-    "train_psnr": "PSNR on training views",
-    "gaussians": "number of Gaussians",
-    "lambda_max": "λ max",
-    "lambda_second": "second largest λ",
-    "lambda_min": "λ min",
-    "eigenvalue_ratio": "λ max / λ min",
-    "negative_ratio": "|λ min| / λ max",
-    "finite_curvature": "curvature by steps of Adam",
-    "depth_gradient": "gradient, depth : lateral",
-    "needles": "share of e₁ on needles",
-    "one_gaussian": "share of e₁ on one Gaussian",
-    "opacity_one_view": "opacity's curvature ~ one view",
-}
-
-
 def draw_predictors(table: pd.DataFrame) -> Figure:
     """A panel for each kind of tau, a row a quantity."""
     names = list(dict.fromkeys(table["quantity"]))[::-1]
@@ -109,17 +93,3 @@ def draw_predictors(table: pd.DataFrame) -> Figure:
         words = f"Kendall's tau with PSNR on held-out views, {max(table['n'], default=0)} runs"
         panels[1].set_xlabel(f"{words}; orange: p < {SIGNIFICANT} after Holm's correction")
     return figure
-
-
-def words_of(quantity: str) -> str:
-    """What a quantity of a run is called in a figure.
-
-    >>> words_of("trace_means"), words_of("one_gaussian"), words_of("share_scene")
-    ('trace of position', 'share of e₁ on one Gaussian', 'share, scene units')
-    """
-    for metric in ("scene", "optimiser"):
-        if quantity.endswith(f"_{metric}"):
-            return f"{words_of(quantity.removesuffix(f'_{metric}'))}, {metric} units"
-    if quantity.startswith("trace_"):
-        return f"trace of {attribute_name(quantity.removeprefix('trace_'))}"
-    return WORDS.get(quantity, quantity.replace("_", " "))

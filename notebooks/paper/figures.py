@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
-from notebooks.paper.effect_figures import GIVEN, SIGNIFICANT, draw_claims, draw_predictors, words_of
+from notebooks.names import words_of
+from notebooks.paper.effect_figures import GIVEN, SIGNIFICANT, draw_claims, draw_predictors
 from notebooks.paper.effects import BASE, LEAST, SCORE, STABLE, Interval, gain, log_ratios, numbers
 from notebooks.paper.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, Judgement, effect_table
 from splat.model.untrusted import replacing
@@ -73,7 +74,7 @@ def make(
 def captions(rows: pd.DataFrame, found: Sequence[Judgement], related: pd.DataFrame, drawn: Sequence[str]) -> str:
     """Captions of what was drawn, trainings and verdicts as Markdown, from the numbers."""
     words = {
-        "claims": "Effects with their 95% intervals over seeds; diamond: the paper's size.",
+        "claims": "The first effect of each statement over the paper's, with its 95% interval over seeds.",
         "predictors": _of_predictors(related),
         "budget": _of_budget(rows),
         "axes": _of_axes(rows),

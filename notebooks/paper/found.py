@@ -123,25 +123,25 @@ def page(
 
 def lines(rows: pd.DataFrame, answered: pd.DataFrame, switched: pd.DataFrame, found: Sequence[Judgement]) -> str:
     """What README says, a list in Markdown: the answer, two switches, and the paper's statements."""
-    told = {
+    effects = {
         switch: {line["quantity"]: line for line in part.to_dict("records")}
         for switch, part in switched.groupby("switch")
     }
-    verdicts = pd.Series([each.verdict for each in found]).value_counts()
+    counts, verdicts = _counts(rows), pd.Series([each.verdict for each in found]).value_counts()
     gain, time, over = (next(each.effects[0] for each in found if each.number == number) for number in (9, 8, 10))
 
     def changes(switch: str) -> str:
         ratios = {
-            name: interval_text(told[switch][name], "value", "") for name in ("trace", "lambda_max", "eigenvalue_ratio")
+            name: interval_text(effects[switch][name], "value") for name in ("trace", "lambda_max", "eigenvalue_ratio")
         }
         return (
-            f"PSNR on held-out views by {interval_text(told[switch][SCORE], 'value', '+.2f', ' dB')} there, the trace "
+            f"PSNR on held-out views by {interval_text(effects[switch][SCORE], 'value', '+.2f', ' dB')} there, the trace "
             f"{ratios['trace']} times, the largest eigenvalue {ratios['lambda_max']} times, and the paper's index "
             f"{ratios['eigenvalue_ratio']} times."
         )
 
     return "\n".join(_filled(line, "- ") for line in (
-        f"{_counts(rows)['ended']} trainings of 3DGS with seven switches in {_counts(rows)['scenes']} scenes, measures "
+        f"{counts['ended']} trainings of 3DGS with seven switches in {counts['scenes']} scenes, measures "
         f"of the landscape beyond training PSNR and the number of Gaussians: {summary(answered)}",
         f"StableGS's attribute probes change {changes(PROBES)}",
         f"Dropping a fifth of the Gaussians in each step changes {changes(DROPPED)}",
@@ -206,13 +206,13 @@ def _interval(effect: Effect) -> str:
     found = effect.interval
     if found.n < 2:
         return "not measured"
-    return f"{_effect({**vars(found), 'unit': effect.unit})[:-1]}; n = {found.n})"
+    return _effect({**vars(found), "unit": effect.unit}, after=f"; n = {found.n}")
 
 
-def _effect(line: dict, unit: bool = True) -> str:
-    """An effect with its interval: dB with two places, others with two digits."""
+def _effect(line: dict, unit: bool = True, after: str = "") -> str:
+    """An effect with its interval: dB with two places, others with two digits.  after: in the brackets, at their end."""
     words = {"dB": " dB", "×": " times"}.get(line["unit"], "") if unit else " ×" * (line["unit"] == "×")
-    return interval_text(line, "value", "+.2f" if line["unit"] == "dB" else "", words)
+    return interval_text(line, "value", "+.2f" if line["unit"] == "dB" else "", words, after)
 
 
 def _filled(words: str, first: str = "") -> str:

@@ -26,6 +26,7 @@ from scipy.stats import rankdata
 
 from figures.style import BLUE, GREEN, MISSING, UNDETERMINED, VERMILION, new_figure, save, style
 from landscape.errors import InputError
+from notebooks.names import words_of
 from notebooks.statistics import LEAST as FEWEST_SCENES
 from notebooks.statistics import digits, holm, interval, interval_text, jackknife
 from splat.model.untrusted import read_table, write_atomically
@@ -45,8 +46,6 @@ TIMES = {"30": "at 30 dB", "end": "at the end"}  # the answers that were planned
 PAIRS = ("ab", "ad", "bd", "cf", "eg")
 LARGE, SMALL, COLLAPSED, ENOUGH, LEAST = 0.2, 0.25, 20.0, 400, 12
 ROW = 0.19  # inches
-WORDS = {"trace_means": "trace of position", "lambda_max": "λ max", "eigenvalue_ratio": "λ max / λ min"}
-WORDS |= {"coadaptation": "co-adaptation", "ensemble": "difference of seeds"}
 COLUMNS = (
     "at", "measure", "tau", "low", "high", "p", "holm", "alike", "scenes", "agreement", "pair", "gain", "n", "missing",
     "left_out", "answer",
@@ -180,7 +179,7 @@ def draw_prediction(table: pd.DataFrame) -> Figure:
                     axes.annotate(
                         f"{line['agreement']:.0%}", (1.01, place), xycoords=("axes fraction", "data"), va="center"
                     )
-            axes.set_title("at the end" if at == "end" else f"at {at} dB", loc="left")
+            axes.set_title(TIMES.get(at, f"at {at} dB"), loc="left")
             axes.set(xlim=(-1.05, 1.05))
             axes.grid(True, axis="x")
             axes.set_yticks(range(len(names)), [name_of(name) for name in names])
@@ -229,5 +228,4 @@ def name_of(measure: str) -> str:
     >>> name_of("trace_means"), name_of("order_fragility_new")
     ('trace of position', 'order fragility, new poses')
     """
-    name = measure.removesuffix("_new")
-    return WORDS.get(name, name.replace("_", " ")) + ", new poses" * measure.endswith("_new")
+    return words_of(measure.removesuffix("_new")) + ", new poses" * measure.endswith("_new")
