@@ -1,7 +1,7 @@
 # The public names, for type checkers and for `__init__.py`, which imports a module when its first name is used.
-from .eigen.approximate import renderer_eigenpairs as renderer_eigenpairs
 from .eigen.eigen import EigenSettings as EigenSettings
 from .eigen.eigen import extreme_eigenpairs as extreme_eigenpairs
+from .eigen.eigen import renderer_eigenpairs as renderer_eigenpairs
 from .eigen.lanczos import LanczosFactorization as LanczosFactorization
 from .eigen.lanczos import lanczos as lanczos
 from .eigen.pairs import EigenEnds as EigenEnds
@@ -11,7 +11,9 @@ from .eigen.power import power_ends as power_ends
 from .eigen.power import power_iteration as power_iteration
 from .errors import InputError as InputError
 from .operators.checks import OperatorCheck as OperatorCheck
+from .operators.checks import RendererCheck as RendererCheck
 from .operators.checks import check_operator as check_operator
+from .operators.checks import check_renderer as check_renderer
 from .operators.distributed import DistributedOperator as DistributedOperator
 from .operators.distributed import Ranks as Ranks
 from .operators.objective import ObjectiveHessian as ObjectiveHessian
@@ -22,10 +24,8 @@ from .operators.operator import RestrictedOperator as RestrictedOperator
 from .operators.operator import ScaledOperator as ScaledOperator
 from .operators.operator import SumOperator as SumOperator
 from .operators.operator import SymmetricOperator as SymmetricOperator
-from .operators.renderer.check import RendererCheck as RendererCheck
-from .operators.renderer.check import check_renderer as check_renderer
-from .operators.renderer.renderer import ProductErrors as ProductErrors
-from .operators.renderer.renderer import RendererHessian as RendererHessian
+from .operators.renderer import ProductErrors as ProductErrors
+from .operators.renderer import RendererHessian as RendererHessian
 from .results import Bracket as Bracket
 from .results import Progress as Progress
 from .results import StopReason as StopReason

@@ -18,18 +18,18 @@ from math import ceil
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.linalg import gram
 from landscape.operators.operator import require_finite
-from landscape.operators.renderer.renderer import LinearView, RendererHessian
+from landscape.operators.renderer import LinearView, RendererHessian
 from landscape.probes import draw_probes
 from landscape.traces.diagonal import DiagonalEstimate, mean_diagonal
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.hutchinson import GROUP, LEAST
-from landscape.traces.quadratic import FEWEST, PowerSums, mean_interval, power_sums
+from landscape.traces.quadratic import FEWEST, mean_interval, power_sums
 
 GIB = 1 << 30
 AT_ONCE = 8  # samples whose blocks are kept
@@ -61,22 +61,18 @@ def gauss_newton_traces(
     >>> found.low < 10 < found.high, found.probes
     (True, 400)
     """
-    _require_samples(samples, LEAST)
-    groups: dict[str, list[PowerSums]] = {name: [] for name in hessian.blocks}
-    values: dict[str, list[Tensor]] = {name: [] for name in hessian.blocks}
-    fitting = int(memory * GIB / (2 * hessian.dim * torch.finfo(hessian.dtype).bits / 8))
-    for count in _sizes(samples, min(max(fitting, 2 * FEWEST), GROUP)):
-        grams = {name: torch.zeros(count, count, dtype=torch.float64) for name in hessian.blocks}
-        for U, C in _sampled(hessian, generator, count):
+    fitting = int(memory * GIB / (2 * hessian.point.nbytes))
+    sizes = _sizes(samples, LEAST, min(max(fitting, 2 * FEWEST), GROUP))
+    grams = {name: [torch.zeros(size, size, dtype=torch.float64) for size in sizes] for name in hessian.blocks}
+    for group, size in enumerate(sizes):
+        for U, C in _sampled(hessian, generator, size):
             for name, rows in hessian.blocks.items():
-                grams[name] += gram(U[rows], C[rows]).cpu() / len(hessian.views)
-        for name, G in grams.items():
-            values[name].append(G.diagonal())
-            groups[name].append(power_sums(torch.eye(count, dtype=G.dtype), G, "gaussian"))  # I^T G = G
+                grams[name][group] += gram(U[rows], C[rows]).cpu() / len(hessian.views)
     found = {}
     for name, rows in hessian.blocks.items():
-        each = torch.cat(values[name])
-        error, low, high = mean_interval(float(each.mean()), samples, groups[name], confidence)
+        each = torch.cat([G.diagonal() for G in grams[name]])
+        sums = [power_sums(torch.eye(len(G), dtype=G.dtype), G, "gaussian") for G in grams[name]]  # I^T G = G
+        error, low, high = mean_interval(float(each.mean()), samples, sums, confidence)
         found[name] = TraceEstimate(
             name, rows.stop - rows.start, float(each.mean()), error, low, high, confidence, samples, samples,
             "matvec budget", each, "pixels",
@@ -85,15 +81,10 @@ def gauss_newton_traces(
 
 
 def gauss_newton_diagonal(hessian: RendererHessian, generator: torch.Generator, samples: int = 32) -> DiagonalEstimate:
-    """diag G with a standard error for every entry, from so many samples (3 or more).
-
-    Memory: n x samples numbers in float64.
-    """
-    _require_samples(samples, 3)
-    found = torch.zeros(hessian.dim, samples, dtype=torch.float64, device=hessian.parameters.device)
-    for U, C in _sampled(hessian, generator, samples):
-        found += U.double() * C.double() / len(hessian.views)
-    return mean_diagonal(found, hessian, samples, "pixels")
+    """diag G with a standard error for every entry, from so many samples (3 or more); keeps n x samples numbers in float64."""
+    (size,) = _sizes(samples, 3, samples)
+    products = (U.double() * C.double() / len(hessian.views) for U, C in _sampled(hessian, generator, size))
+    return mean_diagonal(sum(products, torch.zeros(())), hessian, samples, "pixels")
 
 
 def gauss_newton_blocks(
@@ -103,17 +94,15 @@ def gauss_newton_blocks(
 
     groups: numbers of rows; for Gaussians, a row for each with the numbers of its 3, 6 or 11 parameters.
     """
-    _require_samples(samples, 3)
     if groups.ndim != 2 or groups.is_floating_point() or not ((groups >= 0) & (groups < hessian.dim)).all():
         raise InputError(
-            f"expected groups as numbers of rows in 0..{hessian.dim - 1}, of shape (groups, rows of each), got {groups.dtype} "
-            f"of shape {tuple(groups.shape)}"
+            f"expected groups x d numbers of rows in 0..{hessian.dim - 1}, got {groups.dtype} of shape {tuple(groups.shape)}"
         )
-    total = torch.zeros(*groups.shape, groups.shape[1], dtype=torch.float64, device=hessian.parameters.device)
-    squares, where = total.clone(), groups.to(total.device)
-    for count in _sizes(samples, AT_ONCE):
-        parts = torch.zeros(count, *total.shape, dtype=total.dtype, device=total.device)
-        for U, C in _sampled(hessian, generator, count):
+    where = groups.to(hessian.point.device)
+    total, squares = torch.zeros(2, *groups.shape, groups.shape[1], dtype=torch.float64, device=where.device)
+    for size in _sizes(samples, 3, AT_ONCE):
+        parts = torch.zeros(size, *total.shape, dtype=total.dtype, device=total.device)
+        for U, C in _sampled(hessian, generator, size):
             for part, u, c in zip(parts, U.double().T, C.double().T, strict=True):
                 outer = u[where][:, :, None] * c[where][:, None, :]
                 part += (outer + outer.mT) / (2 * len(hessian.views))
@@ -124,38 +113,24 @@ def gauss_newton_blocks(
     return BlockEstimate(mean, spread.sqrt())
 
 
-def _require_samples(samples: int, least: int) -> None:
+def _sizes(samples: int, least: int, most: int) -> list[int]:
+    """Sizes of groups of at most so many samples, equal to within one.  InputError for fewer samples than the least."""
     if samples < least:
         raise InputError(f"expected at least {least} samples, got {samples}")
+    return [len(part) for part in torch.arange(samples).tensor_split(ceil(samples / most))]
 
 
-def _sizes(samples: int, most: int) -> list[int]:
-    """Sizes of groups of at most so many samples, equal to within one."""
-    count = ceil(samples / most)
-    return [samples // count + (index < samples % count) for index in range(count)]
-
-
-def _sampled(
-    hessian: RendererHessian, generator: torch.Generator, count: int
-) -> Iterator[tuple[Float[Tensor, "n count"], Float[Tensor, "n count"]]]:
-    """u and c of each view, for so many samples."""
+def _sampled(hessian: RendererHessian, generator: torch.Generator, count: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """u and c of each view, for so many samples, as columns."""
+    pull = hessian.parameters.vjp
     for index in range(len(hessian.views)):
         view = hessian.linear(index)
-        Z = draw_probes(view.free.numel(), count, generator, view.free.dtype)
+        Z = draw_probes(view.free.numel(), count, generator, view.free.dtype).T.reshape(count, *view.free.shape)
         diagonal = _diagonal(view, generator)
-        columns = [], []
-        for z in Z.T:
-            z = z.reshape(view.free.shape)
-            if diagonal is None:
-                pair = hessian.parameters.vjp(view.image, z, keep=True), view.curvature(z)
-                columns[0].append(pair[0])
-                columns[1].append(hessian.parameters.vjp(view.image, pair[1], keep=True))
-            else:
-                columns[0].append(hessian.parameters.vjp(view.image, diagonal.sqrt() * z, keep=True))
-        U = torch.stack(columns[0], dim=1)
-        C = torch.stack(columns[1], dim=1) if columns[1] else U
-        require_finite(hessian, bool(torch.isfinite(U).all() and torch.isfinite(C).all()))
-        yield U, C
+        cotangents = (Z, map(view.curvature, Z)) if diagonal is None else (diagonal.sqrt() * Z,)
+        pulled = [torch.stack([pull(view.image, each, keep=True) for each in some], dim=1) for some in cotangents]
+        require_finite(hessian, all(bool(torch.isfinite(each).all()) for each in pulled))
+        yield pulled[0], pulled[-1]
 
 
 def _diagonal(view: LinearView, generator: torch.Generator) -> Tensor | None:

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from landscape import gauss_newton_blocks, gauss_newton_diagonal, gauss_newton_traces
-from landscape.operators.renderer.renderer import RendererHessian
+from landscape.operators.renderer import RendererHessian
 from tests.landscape.foreign import Bumps
 from tests.refusals import refused
 

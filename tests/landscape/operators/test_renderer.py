@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.operators.renderer import renderer
-from landscape.operators.renderer.renderer import RendererHessian
+from landscape.operators import renderer
+from landscape.operators.renderer import RendererHessian
 from notebooks.renderer.scenes import demo, directions
 from tests.landscape.foreign import Bumps
 from tests.refusals import refused

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from landscape.errors import InputError
-from landscape.operators.renderer.check import check_renderer, require_resolved
+from landscape.operators.checks import check_renderer, require_resolved
 from tests.landscape.foreign import Bumps
 
 
