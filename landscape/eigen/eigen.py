@@ -90,8 +90,8 @@ def renderer_eigenpairs(
     """`extreme_eigenpairs` of a renderer's Hessian or Gauss-Newton, with residuals that include the errors of products.
 
     Some eigenvalue of H is within |H~ v - lambda v| + |e| of lambda, for products H~ v with errors e, of which the search sees
-    only what is not symmetric.  It asks for no residual below the error of a random unit vector; those of the eigenvectors are
-    added to theirs.  Where these miss the settings' goal, the reason is "noise floor".  InputError where steps resolve nothing.
+    only what is not symmetric: its floor is the error of a random unit vector, and those of the eigenvectors are added.  Where
+    they miss the settings' goal, the reason is "noise floor".  InputError where steps do not resolve the products.
 
     >>> x = torch.tensor([0.5, 2.0], requires_grad=True, dtype=torch.float64)
     >>> H = RendererHessian(lambda t: torch.exp(t * x), {"x": x}, lambda image, t: image.square().sum() / 2, [1.0])

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from math import inf, isfinite, nan
 
 import torch
-from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
@@ -78,12 +77,10 @@ def check_operator(
 class RendererCheck:
     """Whether a renderer repeats itself, jumps, and has the gradient of its image.
 
-    noise: standard deviation of the image between equal renders, as a share of its size.
-    kinks: share of |J v|^2 in pixels whose one-sided differences disagree, for a random v.
+    noise: standard deviation of equal renders, as a share of the image.  kinks: of a random v (`ProductErrors`).
     gradients: v . J^T (J v) / |J v|^2 - 1 of each block's random v, J v by differences and J^T by the backward pass: 0.1 where
         the gradient in that parameter is 1.1 times too large; and the change of this number at steps twice as long.
-    unseen: blocks whose random vector changes no image.
-    error: |error of H v| / |H v| for a random v (`ProductErrors.total`).
+    unseen: blocks whose random vector changes no image.  error: |error of H v| / |H v| for a random v.
     """
 
     deterministic: bool
@@ -102,9 +99,7 @@ class RendererCheck:
             for name, (off, spread) in self.gradients.items()
             if not abs(off) <= WRONG + 2 * spread
         ]
-        found += [
-            f"expected images that depend on {each!r}, got none that changes; leave it out" for each in self.unseen
-        ]
+        found += [f"expected images that depend on {one!r}, got none that changes; leave it out" for one in self.unseen]
         others = {
             f"expected equal images from equal renders, got a difference of {self.noise:.1e} of their size; fix the "
             "renderer's random numbers, or read errors that include this noise": not self.deterministic,
@@ -135,13 +130,11 @@ def require_resolved(hessian: RendererHessian, generator: torch.Generator) -> fl
     """The error of a product with a random unit vector.  Raises InputError where it is as long as the product."""
     _, stated, error = _random_product(hessian, generator)
     if not error < UNRESOLVED:
-        raise InputError(
-            f"expected products that steps resolve, got an error of {error:.0%} of their length; ask check_renderer why"
-        )
+        raise InputError(f"expected products that steps resolve, got an error of {error:.0%}; ask check_renderer why")
     return float(stated.total)
 
 
-def _random_product(hessian: RendererHessian, generator: torch.Generator) -> tuple[Tensor, ProductErrors, float]:
+def _random_product(hessian: RendererHessian, generator: torch.Generator) -> tuple[torch.Tensor, ProductErrors, float]:
     """Unit vectors over all rows and over each block; errors of the first one's product; error / length, inf for all noise."""
     V = draw_probes(hessian.dim, 1 + len(hessian.blocks), generator, hessian.dtype)
     for column, rows in zip(V.T[1:], hessian.blocks.values(), strict=True):
@@ -152,7 +145,7 @@ def _random_product(hessian: RendererHessian, generator: torch.Generator) -> tup
     return V, stated, float(stated.total) / length if length else inf if hessian.noise else 0.0
 
 
-def _gradient_ratios(hessian: RendererHessian, V: Tensor, factor: float) -> dict[str, float]:
+def _gradient_ratios(hessian: RendererHessian, V: torch.Tensor, factor: float) -> dict[str, float]:
     """v . J^T (J v) / |J v|^2 over all views, of the vector of each block that changes an image."""
     pulled, squares = torch.zeros(2, V.shape[1], dtype=torch.float64)
     with hessian.parameters.restored(hessian.point):

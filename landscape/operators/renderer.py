@@ -9,22 +9,21 @@
     J v               (I+ - I) / h            and  (I - I-) / h
     the second term   (J+^T g - J^T g) / h    and  (J^T g - J-^T g) / h
 
-Differences of gradients of the loss, which public tools take, see the kinks of the loss as well: under an L1 loss they are
-wrong by more than the length of H v.  An image jumps where a splat falls under a threshold or two splats change their order,
-which adds jump / h to one estimate: `one_sided` takes the smaller one where the two disagree, else their mean.
+Differences of gradients of the loss, which public tools take, see its kinks as well: under an L1 loss they are wrong by more
+than the length of H v.  An image jumps where a splat falls under a threshold or two splats change their order, which adds
+jump / h to one estimate: `one_sided` takes the smaller one where the two disagree, else their mean.
 
 **The step h.**  |.| is the root mean square, dI the image's change in a step.  Rounding the image, by u = eps / 4 of its size
-on average, makes a relative error u |I| / |dI| in J v.  Jumps make differences one-sided in pixels whose share grows with the
-step, an error like |dI| / |I|.  The two are equal at |dI| = sqrt(u) |I|.  Noise between equal renders takes the place of u
-where it is larger.  TRIALS renders find h, in the first view that v changes; each before it costs as many.
+on average, or noise u between equal renders, makes a relative error u |I| / |dI| in J v; jumps make differences one-sided in a
+share of pixels like |dI| / |I|.  The two are equal at |dI| = sqrt(u) |I|.  TRIALS renders of the first view that v changes find
+h; each view before it costs as many.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass
 from math import isfinite, sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -33,8 +32,9 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.linalg import column_lengths
 from landscape.operators.operator import require_blocks, require_finite, require_vectors
-from landscape.results import ShortRepr
 
+Render = Callable[[Any], Tensor]
+Loss = Callable[[Tensor, Any], Tensor]
 TRIALS = 2  # renders that find a step
 FACTOR = 1e4  # the largest by which a trial changes h
 ROUNDING = 1 / 4  # mean error of a rounded number, in units of eps
@@ -43,13 +43,12 @@ SEEN = 3  # times the noise: a smaller change of an image may be noise alone, as
 
 
 class Parameters:
-    """Named leaf tensors as one vector, moved in place.  blocks: their rows, those of neighbours as sh/dc and sh/rest as one."""
+    """Named leaf tensors as one vector, moved in place.  blocks: their rows; neighbours such as sh/dc and sh/rest are one."""
 
     def __init__(self, named: Mapping[str, Tensor]) -> None:
         if not isinstance(named, Mapping) or not named:
             raise InputError(f"expected a dict of named tensors as parameters, got {type(named).__name__} without any")
-        self.tensors, self.dim = list(named.values()), 0
-        self.blocks: dict[str, slice] = {}
+        self.tensors, self.blocks, self.dim = list(named.values()), dict[str, slice](), 0
         for name, tensor in named.items():
             if not (isinstance(tensor, Tensor) and tensor.is_leaf and tensor.requires_grad):
                 raise InputError(
@@ -62,10 +61,8 @@ class Parameters:
             self.dim += tensor.numel()
             self.blocks[block] = slice(self.blocks.get(block, slice(start, start)).start, self.dim)
         require_blocks(self.blocks, self.dim)
-        kinds = {(tensor.dtype, tensor.device) for tensor in self.tensors}
-        if len(kinds) > 1:
+        if len(kinds := {(tensor.dtype, tensor.device) for tensor in self.tensors}) > 1:
             raise InputError(f"expected parameters of one type on one device, got {sorted(map(str, kinds))}")
-        self.dtype, self.device = kinds.pop()
 
     def vector(self, parts: Sequence[Tensor] | None = None) -> Float[Tensor, " n"]:
         """A copy of tensors of the parameters' shapes, of these as they are now by default, as one vector."""
@@ -95,8 +92,7 @@ class Parameters:
         return self.vector(parts)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ProductErrors(ShortRepr):
+class ProductErrors(NamedTuple):
     """Errors of the products with k vectors; J^T, the renderer's own backward pass, is taken as exact (`check_renderer`).
 
     step: length of the difference to the product at twice the step.  An error in proportion to h or a higher power changes by
@@ -115,8 +111,7 @@ class ProductErrors(ShortRepr):
         return 2 * torch.hypot(self.step, self.noise)
 
 
-@dataclass(frozen=True, eq=False)
-class LinearView:
+class LinearView(NamedTuple):
     """A view at the point, by its number: image with its graph, loss, and g, whose graph begins at `free`, an equal image."""
 
     index: int
@@ -153,12 +148,10 @@ class RendererHessian:
     render: from a view to its image, a tensor of any shape that depends on the parameters as they are at the call.
     parameters: the leaf tensors by name, of one type on one device; each is a block (`Parameters`).
     loss: from (image, view) to a scalar tensor, by torch operations that are differentiable twice in the image.
-    views: two graphs at most are held, whatever their number.
     noise: standard deviation of the renderer's noise, relative to the image's root mean square; raised to what two renders of
-        the first view show.  deterministic: whether these are equal.
+        the first view show.  deterministic: whether these are equal.  value, gradient: of the mean loss.
 
-    value, gradient: of the mean loss, at the point where it was made.  change: |dI| / |I| of a step.
-    Products move the parameters in place, and bring them back to the bit, after an exception too.  Approximations: see `error`.
+    Products hold two graphs at most.  They move the parameters, and bring them back to the bit, after an exception too.
 
     >>> x = torch.tensor([0.5, 2.0], dtype=torch.float64, requires_grad=True)
     >>> H = RendererHessian(lambda t: torch.exp(t * x), {"x": x}, lambda image, t: image.square().sum() / 2, [1.0, 1.0])
@@ -169,12 +162,7 @@ class RendererHessian:
     """
 
     def __init__(
-        self,
-        render: Callable[[Any], Tensor],
-        parameters: Mapping[str, Tensor],
-        loss: Callable[[Tensor, Any], Tensor],
-        views: Sequence[Any],
-        noise: float = 0.0,
+        self, render: Render, parameters: Mapping[str, Tensor], loss: Loss, views: Sequence[Any], noise: float = 0.0
     ) -> None:
         if not len(views):
             raise InputError("expected at least one view, got none")
@@ -182,22 +170,21 @@ class RendererHessian:
             raise InputError(f"expected a noise of 0 or more, as a share of the image's size, got {noise}")
         self.render, self.loss, self.views, self.curved = render, loss, views, True
         self.parameters = Parameters(parameters)
-        self.dim, self.dtype, self.blocks = self.parameters.dim, self.parameters.dtype, self.parameters.blocks
         self.point = self.parameters.vector()
+        self.dim, self.dtype, self.blocks = self.parameters.dim, self.point.dtype, self.parameters.blocks
         gradient = torch.zeros_like(self.point, dtype=torch.float64)
-        losses, seen, self.kept = [], 0.0, {}  # J^T g of the first views
+        total, seen, self.kept = 0.0, 0.0, {}  # J^T g of the first views
         for index in range(len(views)):
             view = self.linear(index)
             Jg = self.parameters.vjp(view.image, view.gradient.detach())
-            gradient += Jg
-            losses.append(view.loss)
+            total, gradient = total + view.loss, gradient + Jg
             if (index + 1) * Jg.nbytes <= KEPT:
                 self.kept[index] = Jg
             if index == 0:
                 seen = rms(self.image(0, view.image) - view.image) / sqrt(2) / (rms(view.image) or 1.0)
-        self.value, self.gradient = sum(losses) / len(losses), (gradient / len(views)).to(self.dtype)
+        self.value, self.gradient = total / len(views), (gradient / len(views)).to(self.dtype)
         self.deterministic, self.noise = seen == 0, max(seen, noise)
-        self.change = sqrt(max(self.noise, ROUNDING * torch.finfo(self.dtype).eps))
+        self.change = sqrt(max(self.noise, ROUNDING * torch.finfo(self.dtype).eps))  # |dI| / |I| of a step
 
     @property
     def gauss_newton(self) -> "RendererHessian":
@@ -225,12 +212,10 @@ class RendererHessian:
         """H V and its errors."""
         column_lengths(V, "vectors")
         HV, kinks, _ = self.products(V)
-        longer = torch.linalg.vector_norm(HV.double() - self.products(V, factor=2.0)[0], dim=0)
-        noise = torch.zeros_like(longer)
-        if self.noise:
-            noise = torch.linalg.vector_norm(HV.double() - self.products(V)[0], dim=0) / sqrt(2)
-        require_finite(self, bool(torch.isfinite(longer + noise).all()))
-        return HV, ProductErrors(longer, noise, kinks)
+        others = self.products(V, factor=2.0)[0], self.products(V)[0] if self.noise else HV
+        longer, again = (torch.linalg.vector_norm(HV.double() - other, dim=0) for other in others)
+        require_finite(self, bool(torch.isfinite(longer + again).all()))
+        return HV, ProductErrors(longer, again / sqrt(2), kinks)
 
     def loss_at(self, theta: Float[Tensor, " n"]) -> Float64[Tensor, ""]:
         """The mean loss at other parameters, for slices and finite steps, from one thread alone: a render of each view."""
@@ -257,18 +242,17 @@ class RendererHessian:
                         kinks[:, j] += torch.stack([squares[apart].sum(), squares.sum()]).cpu()
         return total / len(self.views), kinks[0] / kinks[1].clamp_min(1e-300), steps
 
+    @torch.enable_grad()
     def linear(self, index: int) -> LinearView:
         """A view at the present parameters.  InputError where image or loss cannot be used."""
         image = self.image(index, graph=True)
         free = image.detach().clone().requires_grad_()
-        with torch.enable_grad():
-            value = self.loss(free, self.views[index])
-            if not isinstance(value, Tensor) or value.ndim or not torch.isfinite(value) or not value.requires_grad:
-                raise InputError(
-                    f"expected a finite scalar tensor that depends on the image as loss of view {index}, got {value}; keep to "
-                    "torch, without .item() and .detach()"
-                )
-            (gradient,) = torch.autograd.grad(value, free, create_graph=True)
+        value = self.loss(free, self.views[index])
+        if not isinstance(value, Tensor) or value.ndim or not torch.isfinite(value) or not value.requires_grad:
+            raise InputError(
+                f"expected a finite scalar tensor that depends on the image as loss of view {index}, got {value}; keep to torch"
+            )
+        (gradient,) = torch.autograd.grad(value, free, create_graph=True)
         return LinearView(index, image, free, float(value.detach()), gradient)
 
     def image(self, index: int, like: Tensor | None = None, graph: bool = False) -> Tensor:
@@ -278,8 +262,7 @@ class RendererHessian:
         if not isinstance(image, Tensor) or image.requires_grad < graph:
             kind = "a tensor without a gradient" if isinstance(image, Tensor) else type(image).__name__
             raise InputError(
-                f"expected render(view) to give a tensor that depends on the parameters, got {kind} for view {index}; leave "
-                "out torch.no_grad, .detach() and .numpy()"
+                f"expected an image that depends on the parameters, got {kind} for view {index}; leave out no_grad and detach"
             )
         if like is not None and image.shape != like.shape:
             raise InputError(

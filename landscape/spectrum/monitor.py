@@ -5,8 +5,7 @@
         ...                                            # their step
         monitor(step, lambda: RendererHessian(...))    # called at steps that are recorded alone
 
-Traces are those of Gauss-Newton, by backward passes alone; eigenvalues are those of the Hessian, with the errors of its
-products; indices are left empty.
+Traces are those of Gauss-Newton, by backward passes alone; eigenvalues have the errors of products; indices are left empty.
 """
 
 import os
@@ -48,14 +47,11 @@ class Monitor:
         self.path.parent.mkdir(parents=True, exist_ok=True)
 
     def __call__(self, step: int, hessian: RendererHessian | Callable[[], RendererHessian]) -> bool:
-        """Record this step where it is one of those; returns whether it was.
-
-        What the renderer or its noise refuse becomes the note of a skipped record: the training goes on.
-        """
-        import pandas as pd  # slow to import
-
+        """Record this step if it is one of those; returns whether it is.  A refusal becomes the note of a skipped record."""
         if step % self.every:
             return False
+        import pandas as pd  # slow to import
+
         start = perf_counter()
         row = dict.fromkeys(COLUMNS) | {"step": step, "gaussians": 0, "state": "skipped"}
         try:
@@ -71,7 +67,6 @@ class Monitor:
         except InputError as error:
             row["note"] = str(error)
         self.rows.append(row | {"seconds": perf_counter() - start})
-        partial = self.path.with_suffix(".partial")
-        pd.DataFrame(self.rows).to_csv(partial, index=False)
+        pd.DataFrame(self.rows).to_csv(partial := self.path.with_suffix(".partial"), index=False)
         os.replace(partial, self.path)
         return True

@@ -1,10 +1,9 @@
 """Traces, diagonal and blocks of Gauss-Newton, G = J^T l'' J, of a renderer by backward passes alone: no step to choose.
 
-z is a vector of standard normal numbers, one for each number of the image of a view.  Then E z z^T = I and
+z is a vector of standard normal numbers, one for each number of the image of a view.  As E z z^T = I, E u c^T = J^T l'' J for
 
     u = J^T B z,  c = u                where l'' = B B^T is diagonal, as for sums over pixels; one backward pass
     u = J^T z,    c = J^T l'' z        where l'' couples pixels, as SSIM does, or is negative somewhere; two
-    E u c^T = J^T l'' J
 
 Each view has numbers of its own; G is the mean over the views.  That l'' is diagonal is seen from two vectors of random signs
 s: the products s * (l'' s) are then equal, and are its diagonal.
@@ -24,14 +23,13 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.linalg import gram
 from landscape.operators.operator import require_finite
-from landscape.operators.renderer import LinearView, RendererHessian
+from landscape.operators.renderer import RendererHessian
 from landscape.probes import draw_probes
 from landscape.traces.diagonal import DiagonalEstimate, mean_diagonal
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.hutchinson import GROUP, LEAST
 from landscape.traces.quadratic import FEWEST, mean_interval, power_sums
 
-GIB = 1 << 30
 AT_ONCE = 8  # samples whose blocks are kept
 SAME = 16  # units of round-off by which two products with a diagonal l'' may differ
 
@@ -44,11 +42,7 @@ class BlockEstimate(NamedTuple):
 
 
 def gauss_newton_traces(
-    hessian: RendererHessian,
-    generator: torch.Generator,
-    samples: int = 32,
-    confidence: float = 0.95,
-    memory: float = 2.0,
+    H: RendererHessian, generator: torch.Generator, samples: int = 32, confidence: float = 0.95, memory: float = 2.0
 ) -> dict[str, TraceEstimate]:
     """The trace of each block of G with its interval, by name, from so many samples (8 or more).
 
@@ -61,56 +55,52 @@ def gauss_newton_traces(
     >>> found.low < 10 < found.high, found.probes
     (True, 400)
     """
-    fitting = int(memory * GIB / (2 * hessian.point.nbytes))
-    sizes = _sizes(samples, LEAST, min(max(fitting, 2 * FEWEST), GROUP))
-    grams = {name: [torch.zeros(size, size, dtype=torch.float64) for size in sizes] for name in hessian.blocks}
+    sizes = _sizes(samples, LEAST, min(max(int(memory * 2**30 / (2 * H.point.nbytes)), 2 * FEWEST), GROUP))
+    grams = {name: [torch.zeros(size, size, dtype=torch.float64) for size in sizes] for name in H.blocks}
     for group, size in enumerate(sizes):
-        for U, C in _sampled(hessian, generator, size):
-            for name, rows in hessian.blocks.items():
-                grams[name][group] += gram(U[rows], C[rows]).cpu() / len(hessian.views)
+        for U, C in _sampled(H, generator, size):
+            for name, rows in H.blocks.items():
+                grams[name][group] += gram(U[rows], C[rows]).cpu() / len(H.views)
     found = {}
-    for name, rows in hessian.blocks.items():
+    for name, rows in H.blocks.items():
         each = torch.cat([G.diagonal() for G in grams[name]])
         sums = [power_sums(torch.eye(len(G), dtype=G.dtype), G, "gaussian") for G in grams[name]]  # I^T G = G
-        error, low, high = mean_interval(float(each.mean()), samples, sums, confidence)
-        found[name] = TraceEstimate(
-            name, rows.stop - rows.start, float(each.mean()), error, low, high, confidence, samples, samples,
-            "matvec budget", each, "pixels",
-        )  # fmt: skip
+        value, n, reason = float(each.mean()), rows.stop - rows.start, "matvec budget"
+        interval = mean_interval(value, samples, sums, confidence)
+        found[name] = TraceEstimate(name, n, value, *interval, confidence, samples, samples, reason, each, "pixels")
     return found
 
 
-def gauss_newton_diagonal(hessian: RendererHessian, generator: torch.Generator, samples: int = 32) -> DiagonalEstimate:
+def gauss_newton_diagonal(H: RendererHessian, generator: torch.Generator, samples: int = 32) -> DiagonalEstimate:
     """diag G with a standard error for every entry, from so many samples (3 or more); keeps n x samples numbers in float64."""
-    (size,) = _sizes(samples, 3, samples)
-    products = (U.double() * C.double() / len(hessian.views) for U, C in _sampled(hessian, generator, size))
-    return mean_diagonal(sum(products, torch.zeros(())), hessian, samples, "pixels")
+    sampled = _sampled(H, generator, *_sizes(samples, 3, samples))
+    products = (U.double() * C.double() / len(H.views) for U, C in sampled)
+    return mean_diagonal(sum(products, torch.zeros(())), H, samples, "pixels")
 
 
 def gauss_newton_blocks(
-    hessian: RendererHessian, generator: torch.Generator, groups: Int64[Tensor, "g d"], samples: int = 32
+    H: RendererHessian, generator: torch.Generator, groups: Int64[Tensor, "g d"], samples: int = 32
 ) -> BlockEstimate:
     """The block of G on each group of d rows, from so many samples (3 or more).
 
     groups: numbers of rows; for Gaussians, a row for each with the numbers of its 3, 6 or 11 parameters.
     """
-    if groups.ndim != 2 or groups.is_floating_point() or not ((groups >= 0) & (groups < hessian.dim)).all():
+    if groups.ndim != 2 or groups.is_floating_point() or not ((groups >= 0) & (groups < H.dim)).all():
         raise InputError(
-            f"expected groups x d numbers of rows in 0..{hessian.dim - 1}, got {groups.dtype} of shape {tuple(groups.shape)}"
+            f"expected groups x d numbers of rows in 0..{H.dim - 1}, got {groups.dtype} {tuple(groups.shape)}"
         )
-    where = groups.to(hessian.point.device)
+    where = groups.to(H.point.device)
     total, squares = torch.zeros(2, *groups.shape, groups.shape[1], dtype=torch.float64, device=where.device)
     for size in _sizes(samples, 3, AT_ONCE):
         parts = torch.zeros(size, *total.shape, dtype=total.dtype, device=total.device)
-        for U, C in _sampled(hessian, generator, size):
+        for U, C in _sampled(H, generator, size):
             for part, u, c in zip(parts, U.double().T, C.double().T, strict=True):
                 outer = u[where][:, :, None] * c[where][:, None, :]
-                part += (outer + outer.mT) / (2 * len(hessian.views))
+                part += (outer + outer.mT) / (2 * len(H.views))
         total += parts.sum(dim=0)
         squares += parts.square().sum(dim=0)
-    mean = total / samples
-    spread = (squares / samples - mean.square()).clamp_min(0) / (samples - 1)
-    return BlockEstimate(mean, spread.sqrt())
+    variance = (squares / samples - (total / samples).square()).clamp_min(0) / (samples - 1)
+    return BlockEstimate(total / samples, variance.sqrt())
 
 
 def _sizes(samples: int, least: int, most: int) -> list[int]:
@@ -120,22 +110,17 @@ def _sizes(samples: int, least: int, most: int) -> list[int]:
     return [len(part) for part in torch.arange(samples).tensor_split(ceil(samples / most))]
 
 
-def _sampled(hessian: RendererHessian, generator: torch.Generator, count: int) -> Iterator[tuple[Tensor, Tensor]]:
+def _sampled(H: RendererHessian, generator: torch.Generator, count: int) -> Iterator[tuple[Tensor, Tensor]]:
     """u and c of each view, for so many samples, as columns."""
-    pull = hessian.parameters.vjp
-    for index in range(len(hessian.views)):
-        view = hessian.linear(index)
-        Z = draw_probes(view.free.numel(), count, generator, view.free.dtype).T.reshape(count, *view.free.shape)
-        diagonal = _diagonal(view, generator)
-        cotangents = (Z, map(view.curvature, Z)) if diagonal is None else (diagonal.sqrt() * Z,)
-        pulled = [torch.stack([pull(view.image, each, keep=True) for each in some], dim=1) for some in cotangents]
-        require_finite(hessian, all(bool(torch.isfinite(each).all()) for each in pulled))
+    for index in range(len(H.views)):
+        view = H.linear(index)
+        n, shape, dtype = view.free.numel(), view.free.shape, view.free.dtype
+        Z = draw_probes(n, count, generator, dtype).T.reshape(count, *shape)
+        signs = draw_probes(n, 2, generator, dtype, "rademacher").T.reshape(2, *shape)
+        once, again = (s * view.curvature(s) for s in signs)
+        tolerance = SAME * torch.finfo(once.dtype).eps * once.abs().max()
+        diagonal = bool((once >= 0).all() and ((once - again).abs() <= tolerance).all())
+        cotangents = (once.sqrt() * Z,) if diagonal else (Z, map(view.curvature, Z))
+        pulled = [torch.stack([H.parameters.vjp(view.image, c, keep=True) for c in some], dim=1) for some in cotangents]
+        require_finite(H, all(bool(torch.isfinite(each).all()) for each in pulled))
         yield pulled[0], pulled[-1]
-
-
-def _diagonal(view: LinearView, generator: torch.Generator) -> Tensor | None:
-    """l'' where it is diagonal and not negative, else None."""
-    signs = draw_probes(view.free.numel(), 2, generator, view.free.dtype, "rademacher")
-    once, again = (s * view.curvature(s) for s in (sign.reshape(view.free.shape) for sign in signs.T))
-    tolerance = SAME * torch.finfo(once.dtype).eps * once.abs().max()
-    return once if bool((once >= 0).all() and ((once - again).abs() <= tolerance).all()) else None

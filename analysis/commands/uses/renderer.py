@@ -1,8 +1,7 @@
 """`landscape probe FILE.py:FACTORY`: the landscape of somebody else's renderer, the `RendererHessian` that FACTORY() returns.
 
-The file is run because it was named, from that path alone; nothing is put on Python's path.  Record, pictures and page are
-those of a scene's probe, less what needs Gaussians, in FACTORY-probe beside the file.  Three numbers a row named "means" are
-positions: a picture shows where these are steep.
+The file is run because it was named; nothing is put on Python's path.  FACTORY-probe beside it holds what a scene's probe does,
+less what needs Gaussians.  Three numbers a row named "means" are positions: a picture shows where these are steep.
 """
 
 import shlex
@@ -14,7 +13,6 @@ from time import perf_counter
 from types import SimpleNamespace
 
 import torch
-from msgspec import UNSET
 from rich.console import Console
 
 from analysis.console.drawing import Draw
@@ -30,7 +28,6 @@ from analysis.records.page.report import write_report
 from analysis.records.provenance import Provenance, provenance, require_seed
 from analysis.records.records import Arrays, Check, Counts, ProbeRecord, record_folder
 from landscape import RendererHessian, check_renderer, gauss_newton_traces, renderer_eigenpairs, spectral_density
-from landscape.eigen.pairs import Eigenpairs
 from landscape.errors import InputError
 from landscape.operators.checks import UNRESOLVED, WRONG
 from landscape.slices.finite_probe import finite_probe
@@ -54,7 +51,7 @@ def run_any_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Dra
     H, out, scene = made_by(path, name), options.out or path.parent / f"{name}-probe", f"{name}() of {path.name}"
     made = provenance(options.seed, command=shlex.join(command), scene=scene, checkpoint=str(options.checkpoint))
     with record_folder(out) as folder, stages:
-        data, arrays = _measured(H, options, made, stages)
+        data, arrays = _probed(H, options, made, stages)
         write_with_pictures(folder, data, arrays, stages, start, drawn)
         write_report(folder)
     conclude(data, out, [])
@@ -63,28 +60,19 @@ def run_any_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Dra
 
 def made_by(path: Path, name: str) -> RendererHessian:
     """What the function of this name in this file returns.  InputError unless it is a `RendererHessian`."""
-    if not path.is_file():
-        raise InputError(f"expected a file with the function {name}, found none at {path}")
     try:
         found = getattr(SimpleNamespace(**run_path(str(path))), name)()
-    except InputError:
-        raise
     except Exception as error:
-        raise InputError(f"expected {name}() of {path} to return, got {type(error).__name__}: {error}") from error
+        raise InputError(f"expected a file with the function {name}, got {type(error).__name__}: {error}") from error
     if not isinstance(found, RendererHessian):
-        raise InputError(
-            f"expected a landscape.RendererHessian from {name}() of {path}, got {type(found).__name__}; return one"
-        )
+        raise InputError(f"expected a landscape.RendererHessian from {name}() of {path}, got {type(found).__name__}")
     return found
 
 
-def _measured(
-    H: RendererHessian, options: ProbeOptions, made: Provenance, stages: Stages
-) -> tuple[ProbeRecord, Arrays]:
+def _probed(H: RendererHessian, options: ProbeOptions, made: Provenance, stages: Stages) -> tuple[ProbeRecord, Arrays]:
     """The record and its arrays; says the work first."""
     settings, (forth, back), size = probe_settings(options), H.passes(vectors=1), H.dim
     most = options.end_products or (60 if options.quick else 300)
-    eigen = replace(settings.eigen, max_matvecs=most, further=0)
     say(
         f"{len(H.views)} views, {size:,} parameters; H v takes {forth} renders and {back} backward passes, "
         f"and there are at most {most + settings.density_matvecs + 4 * len(H.blocks) + 12} of them"
@@ -95,9 +83,15 @@ def _measured(
     with stages.stage("traces"):
         traces = gauss_newton_traces(H, generator, 8 if options.quick else 32)
     with stages.stage("eigenvalues") as report:
-        ends = renderer_eigenpairs(H, generator, eigen, progress=report)
-    with stages.stage("renders"):
-        renders = [_renders(H, pairs) for pairs in (ends.largest, ends.smallest)]
+        ends = renderer_eigenpairs(H, generator, replace(settings.eigen, max_matvecs=most, further=0), progress=report)
+    found = [(ends.largest, 0), (ends.largest, 1), (ends.smallest, 0)]
+    first, second, last = (record.eigenvalue_record(ends, pairs, index, H.blocks) for pairs, index in found)
+    with stages.stage("renders"):  # to the step at which the curvature changes the loss by RISE
+        for row, pairs in ((first, ends.largest), (last, ends.smallest)):
+            if (value := float(pairs.values[0])) and H.value > 0:
+                reach = curvature_reach(value, RISE * H.value)
+                steps = [reach / 2**k for k in range(HALVINGS, -1, -1)]
+                row.renders = record.renders_record(finite_probe(H.loss_at, H.point, pairs.vectors[:, 0], H, steps))
     with stages.stage("slice") as report:
         plane = plane_of(H.loss_at, H.point, H.value, H.gradient, ends, settings, 1, generator, report, notes)
     if settings.density_matvecs:
@@ -108,10 +102,8 @@ def _measured(
         groups = torch.arange(size, device=H.point.device)[H.blocks[POSITIONS]].reshape(-1, 3)
         largest = torch.linalg.eigvalsh(gauss_newton_blocks(H, generator, groups).values)[:, -1]
         arrays["places"] = {"positions": H.point[groups].double().cpu().numpy(), "curvature": largest.cpu().numpy()}
-    found = [(ends.largest, 0), (ends.largest, 1), (ends.smallest, 0)]
-    first, second, last = (record.eigenvalue_record(ends, pairs, index, H.blocks) for pairs, index in found)
-    first.renders, last.renders = renders
     off = max((abs(ratio) - 2 * spread for ratio, spread in check.gradients.values()), default=0.0)
+    none = dict.fromkeys(("gaussians", "visible_gaussians", "sh_degree_stored", "sh_degree_active"), 0)
     return ProbeRecord(
         objective=schema.Objective(value=H.value, gradient_norm=float(H.gradient.norm())),
         traces={name: record.trace_record(trace) for name, trace in traces.items()},
@@ -119,10 +111,7 @@ def _measured(
         anisotropy=record.anisotropy_record(ends, density),
         concentration=record.concentration_record(density),
         slice=plane and record.slice_record(plane, ends.largest),
-        counts=Counts(
-            gaussians=0, visible_gaussians=0, parameters=size, active_parameters=size, sh_degree_stored=0, sh_degree_active=0,
-            views=len(H.views), products=ends.matvecs,
-        ),
+        counts=Counts(**none, parameters=size, active_parameters=size, views=len(H.views), products=ends.matvecs),
         checks={
             "gradient": Check(value=off, bound=WRONG, passed=off <= WRONG),
             "products": Check(value=check.error, bound=UNRESOLVED, passed=check.error < UNRESOLVED),
@@ -131,12 +120,3 @@ def _measured(
         provenance=made,
         timing=stages.timing,
     ), arrays  # fmt: skip
-
-
-def _renders(H: RendererHessian, pairs: Eigenpairs) -> schema.Maybe[schema.Renders]:
-    """Losses along an eigenvector, to the step at which its curvature changes the loss by RISE; UNSET of an eigenvalue 0."""
-    if not (value := float(pairs.values[0])) or H.value <= 0:
-        return UNSET
-    reach = curvature_reach(value, RISE * H.value)
-    steps = [reach / 2**k for k in range(HALVINGS, -1, -1)]
-    return record.renders_record(finite_probe(H.loss_at, H.point, pairs.vectors[:, 0], H, steps))

@@ -12,8 +12,7 @@ nerfstudio    `models/base_model.py` (02b6a46): `model(rays or camera)["rgb"]` i
     config, pipeline, *_ = eval_setup(Path("outputs/.../config.yml"), test_mode="val")
     H = nerfstudio_hessian(pipeline.model, [pipeline.datamanager.next_train(step) for step in range(20)])
 
-Quaternions are taken as they are stored, of any length: curvature in one of length q is 1/q^2 of that at length 1, where
-`landscape probe` measures.
+Quaternions keep the length q that is stored: curvature in one is 1/q^2 of that at length 1, where `landscape probe` measures.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +28,8 @@ from splat.losses.autograd import view_loss
 from splat.losses.reference import LossSettings
 from splat.render.backend import backend_of
 
-STORED = {  # as what graphdeco, gsplat and nerfstudio's splatfacto store each
+View = tuple[Any, Mapping[str, Any]]  # of nerfstudio
+STORED = {  # by graphdeco, gsplat and nerfstudio's splatfacto
     "means": ("_xyz", "means", "means"),
     "log_scales": ("_scaling", "scales", "scales"),
     "quats": ("_rotation", "quats", "quats"),
@@ -40,12 +40,7 @@ STORED = {  # as what graphdeco, gsplat and nerfstudio's splatfacto store each
 
 
 def graphdeco_hessian(
-    render: Callable[..., Mapping[str, Tensor]],
-    gaussians: Any,
-    pipe: Any,
-    background: Tensor,
-    cameras: Sequence[Any],
-    loss: LossSettings = LossSettings(),
+    render: Callable, model: Any, pipe: Any, background: Tensor, cameras: Sequence, loss: LossSettings = LossSettings()
 ) -> RendererHessian:
     """The Hessian over these cameras, of `scene.getTrainCameras()`, at a `GaussianModel`.
 
@@ -61,8 +56,8 @@ def graphdeco_hessian(
     (['means', 'log_scales', 'quats', 'opacity_logits', 'sh'], tensor(True))
     """
     return RendererHessian(
-        lambda camera: render(camera, gaussians, pipe, background)["render"],
-        {name: value for name, (key, *_) in STORED.items() if (value := getattr(gaussians, key)).numel()},
+        lambda camera: render(camera, model, pipe, background)["render"],
+        {name: value for name, (key, *_) in STORED.items() if (value := getattr(model, key)).numel()},
         lambda image, camera: _exact_loss(image, camera.original_image, loss),
         cameras,
     )
@@ -103,15 +98,11 @@ def gsplat_hessian(
         )  # fmt: skip
         return colours[0, ..., :3].permute(2, 0, 1)
 
-    def loss_of(image: Tensor, index: int) -> Tensor:
-        return _exact_loss(image, images[index].permute(2, 0, 1), loss)
-
-    return RendererHessian(image_of, stored, loss_of, range(len(images)))
+    targets = [image.permute(2, 0, 1) for image in images]
+    return RendererHessian(image_of, stored, lambda image, i: _exact_loss(image, targets[i], loss), range(len(targets)))
 
 
-def nerfstudio_hessian(
-    model: Any, views: Sequence[tuple[Any, Mapping[str, Any]]], groups: Sequence[str] | None = None
-) -> RendererHessian:
+def nerfstudio_hessian(model: Any, views: Sequence[View], groups: Sequence[str] | None = None) -> RendererHessian:
     """The Hessian of the mean loss over views, pairs of rays (or a camera) and their batch, at a model in `eval()`.
 
     groups: of the parameters, all by default; each is a block.  Terms of the loss that do not read the picture are constants:
@@ -138,12 +129,12 @@ def nerfstudio_hessian(
     }
     others: dict[str, Any] = {}
 
-    def image_of(view: tuple[Any, Mapping[str, Any]]) -> Tensor:
+    def image_of(view: View) -> Tensor:
         outputs = model(view[0])
         others.update({name: each.detach() if isinstance(each, Tensor) else each for name, each in outputs.items()})
         return outputs["rgb"]
 
-    def loss_of(image: Tensor, view: tuple[Any, Mapping[str, Any]]) -> Tensor:
+    def loss_of(image: Tensor, view: View) -> Tensor:
         losses = model.get_loss_dict(others | {"rgb": image}, view[1])
         return torch.stack([value.reshape(()) for value in losses.values() if isinstance(value, Tensor)]).sum()
 
