@@ -5,8 +5,7 @@ z is a vector of standard normal numbers, one for each number of the image of a 
     u = J^T B z,  c = u                where l'' = B B^T is diagonal, as for sums over pixels; one backward pass
     u = J^T z,    c = J^T l'' z        where l'' couples pixels, as SSIM does, or is negative somewhere; two
 
-Each view has numbers of its own; G is the mean over the views.  That l'' is diagonal is seen from two vectors of random signs
-s: the products s * (l'' s) are then equal, and are its diagonal.
+Each view draws its own; G is their mean.  l'' is diagonal where two vectors s of random signs give one s * l'' s, its diagonal.
 
 **Intervals.**  u . c over a block is a quadratic form z^T S z in the pixels, S = sym(J_b J_b^T l'').  The pairs of samples give
 the entries z_i^T S z_j of its Gram matrix, summed over views, and with them the interval of `quadratic`.  It needs normal z.
@@ -120,7 +119,7 @@ def _sampled(H: RendererHessian, generator: torch.Generator, count: int) -> Iter
         once, again = (s * view.curvature(s) for s in signs)
         tolerance = SAME * torch.finfo(once.dtype).eps * once.abs().max()
         diagonal = bool((once >= 0).all() and ((once - again).abs() <= tolerance).all())
-        cotangents = (once.sqrt() * Z,) if diagonal else (Z, map(view.curvature, Z))
+        cotangents = ((once.sqrt() * z for z in Z),) if diagonal else (Z, map(view.curvature, Z))
         pulled = [torch.stack([H.parameters.vjp(view.image, c, keep=True) for c in some], dim=1) for some in cotangents]
         require_finite(H, all(bool(torch.isfinite(each).all()) for each in pulled))
         yield pulled[0], pulled[-1]

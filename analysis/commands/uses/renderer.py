@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from runpy import run_path
 from time import perf_counter
-from types import SimpleNamespace
+from types import ModuleType
 
 import torch
 from rich.console import Console
@@ -60,10 +60,13 @@ def run_any_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Dra
 
 def made_by(path: Path, name: str) -> RendererHessian:
     """What the function of this name in this file returns.  InputError unless it is a `RendererHessian`."""
+    module = ModuleType(name)
     try:
-        found = getattr(SimpleNamespace(**run_path(str(path))), name)()
+        vars(module).update(run_path(str(path), run_name=path.name))
+        found = getattr(module, name)()
     except Exception as error:
-        raise InputError(f"expected a file with the function {name}, got {type(error).__name__}: {error}") from error
+        said = f"{type(error).__name__}: {error}"
+        raise InputError(f"expected a file with the function {name} that returns at {path}, got {said}") from error
     if not isinstance(found, RendererHessian):
         raise InputError(f"expected a landscape.RendererHessian from {name}() of {path}, got {type(found).__name__}")
     return found
@@ -103,6 +106,7 @@ def _probed(H: RendererHessian, options: ProbeOptions, made: Provenance, stages:
         largest = torch.linalg.eigvalsh(gauss_newton_blocks(H, generator, groups).values)[:, -1]
         arrays["places"] = {"positions": H.point[groups].double().cpu().numpy(), "curvature": largest.cpu().numpy()}
     off = max((abs(ratio) - 2 * spread for ratio, spread in check.gradients.values()), default=0.0)
+    bounded = {"gradient": (off, WRONG), "products": (check.error, UNRESOLVED)}
     none = dict.fromkeys(("gaussians", "visible_gaussians", "sh_degree_stored", "sh_degree_active"), 0)
     return ProbeRecord(
         objective=schema.Objective(value=H.value, gradient_norm=float(H.gradient.norm())),
@@ -112,10 +116,7 @@ def _probed(H: RendererHessian, options: ProbeOptions, made: Provenance, stages:
         concentration=record.concentration_record(density),
         slice=plane and record.slice_record(plane, ends.largest),
         counts=Counts(**none, parameters=size, active_parameters=size, views=len(H.views), products=ends.matvecs),
-        checks={
-            "gradient": Check(value=off, bound=WRONG, passed=off <= WRONG),
-            "products": Check(value=check.error, bound=UNRESOLVED, passed=check.error < UNRESOLVED),
-        },
+        checks={name: Check(value=value, bound=most, passed=value < most) for name, (value, most) in bounded.items()},
         notes=[*notes, *check.sentences, "traces are those of Gauss-Newton"],
         provenance=made,
         timing=stages.timing,
