@@ -81,7 +81,8 @@ def compensation(lens, r1, r2, shrink):
     long, lift = k * inverse, -(beta * D * inverse)
     g1 = scaled(plus(scaled(cross(r2, normal), long), scaled(r1, lift)), above)
     g2 = scaled(plus(scaled(cross(normal, r1), long), scaled(r2, lift)), above)
-    on = select(free, 1.0, 0.0)
+    off = value_of(D) * 0.0
+    on = select(free, off + 1.0, off)
     return C, scaled(g1, on), scaled(g2, on)
 
 

@@ -1,4 +1,4 @@
-"""EWA projection and SH colour of one Gaussian, and their adjoints: formulas for floats and for dual numbers.
+"""EWA projection and SH colour of one Gaussian, and their adjoints: formulas for floats, vectors and dual numbers.
 
 The values are those of `reference.py`, with the 2 x 2 covariance of a splat as a product of two rows:
 
@@ -195,7 +195,7 @@ def projected_axes(lens, mean, scales, quat):
     m0 = scaled(to_camera(lens, c0), scales[0])
     m1 = scaled(to_camera(lens, c1), scales[1])
     m2 = scaled(to_camera(lens, c2), scales[2])
-    longest = max(value_of(scales[0]), value_of(scales[1]), value_of(scales[2]))
+    longest = max(value_of(scales[0]), max(value_of(scales[1]), value_of(scales[2])))
     shrink = 1.0 / max(1.0, longest * max(lens.fx, lens.fy) * value_of(depth))
     gain_x, gain_y = (shrink * lens.fx) * depth, (shrink * lens.fy) * depth
     r1 = (gain_x * (m0[0] - u * m0[2]), gain_x * (m1[0] - u * m1[2]), gain_x * (m2[0] - u * m2[2]))

@@ -20,8 +20,9 @@ Both are linear in the plain ones at a fixed W.  Splats and plain derivatives ar
     `moments_of`, `plain_gradient`        plain adjoint of mean, conic and opacity -> moments; back
 """
 
-from math import log, sqrt
+from math import log
 
+from splat.backend.cpu.dual import sqrt
 from splat.backend.cpu.jit import formula
 from splat.backend.cpu.simd import select
 

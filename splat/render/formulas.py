@@ -27,14 +27,16 @@ the splat:
                     s' = z - beta (R' + r R q'), 0 where 2^l > free;  R' <- R' + z;  moments of s' and G' = sum w h.
 """
 
-from math import ceil, floor, inf, log, log2, sqrt
+from math import ceil, floor, inf, log2
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from splat.backend.cpu.dual import sqrt
+from splat.backend.cpu.exponential import exp2, log
 from splat.backend.cpu.jit import formula
-from splat.backend.cpu.simd import exp2, fma, minimum, select
+from splat.backend.cpu.simd import fma, minimum, select
 from splat.model.settings import RenderSettings
 from splat.projection.whitening import Q0, QU, QUU, QUV, QV, QVV, ROUND
 
@@ -221,10 +223,11 @@ def ellipse_of(splat, alpha_min, contour):
 
 @formula
 def pixels_within(centre, reach, size):
-    """First and last pixel index within reach of centre (in pixel indices), clipped to the image; empty if first > last."""
-    first = ceil(min(max(centre - reach, 0.0), size))
-    last = floor(max(min(centre + reach, size - 1.0), -1.0))
-    return int(first), int(last)
+    """First and last pixel index within reach of centre (in pixel indices), clipped to the image; empty if first > last.
+
+    Whole numbers; integers from floats on the CPU, floats from vectors and Triton's tensors.
+    """
+    return ceil(min(max(centre - reach, 0.0), size * 1.0)), floor(max(min(centre + reach, size - 1.0), -1.0))
 
 
 @formula

@@ -7,9 +7,15 @@ x <- x - rate m_hat / (sqrt(v_hat) + eps),   m_hat = m / (1 - beta1^t),   v_hat 
 
 from math import sqrt
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from splat.backend.cpu.jit import kernel
+from splat.backend.cpu.simd import lanes, lanes_of, load, store
+from splat.backend.cpu.simd import sqrt as root_of
+from splat.backend.cpu.threads import over_range
 
 BETA1, BETA2 = 0.9, 0.999
 EPS = 1e-15  # 3DGS: far below the moments of a loss that is a mean over 10^5 pixels
@@ -25,6 +31,21 @@ def grid_of(dtype: torch.dtype) -> float:
     return 1024 * torch.finfo(dtype).tiny / torch.finfo(dtype).eps
 
 
+@kernel
+def update(start, stop, parameters, gradient, rates, first, second, numbers):
+    """The step of the vectors start..stop.  numbers: 1 - beta1, grid, beta2, 1 - beta2, `bias_corrections`, EPS."""
+    slow, grid, kept, new, root, scale, eps = numbers
+    for i in range(start * lanes(first), stop * lanes(first), lanes(first)):
+        g, m, v = load(gradient, i), load(first, i), load(second, i)
+        m = m + slow * (g - m)
+        m = (m + grid) - grid
+        v = kept * v + new * g * g
+        step = m / (root_of(v) / root + eps) * (load(rates, i) * scale)
+        store(parameters, i, load(parameters, i) - step)
+        store(first, i, m)
+        store(second, i, v)
+
+
 def adam_step(
     parameters: Float[Tensor, " p"],
     gradient: Float[Tensor, " p"],
@@ -34,10 +55,12 @@ def adam_step(
     updates: int,
 ) -> None:
     """Step number `updates`, in place."""
-    (root, scale), grid = bias_corrections(updates), grid_of(m.dtype)
-    m.lerp_(gradient, 1 - BETA1)
-    m.add_(grid).sub_(grid)
-    v.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-    denominator = v.sqrt().div_(root).add_(EPS)
-    step = torch.div(m, denominator, out=denominator).mul_(rates)
-    parameters.sub_(step, alpha=scale)
+    arrays = [array.detach().numpy() for array in (parameters, gradient.contiguous(), rates.contiguous(), m, v)]
+    numbers = (1 - BETA1, grid_of(m.dtype), BETA2, 1 - BETA2, *bias_corrections(updates), EPS)
+    size, L = len(m), lanes_of(arrays[0].dtype)
+    over_range(size // L, update, *arrays, numbers)
+    if rest := size % L:  # the last numbers, in vectors of their own
+        ends = [np.pad(array[-rest:], (0, L - rest)) for array in arrays]
+        over_range(1, update, *ends, numbers)
+        for array, end in zip(arrays, ends, strict=True):
+            array[-rest:] = end[:rest]

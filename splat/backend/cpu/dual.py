@@ -8,8 +8,8 @@ duals, its Jacobian; applied to the adjoint of a function, its Hessian.  Branche
 
     dual(x, dx)         value_of(x)         tangent_of(x)        value_of takes floats too
     variable(a, x, i)   x, whose derivative is 1 in direction i and 0 in the others; a: an array of the tangents' dtype
-    sqrt(x), exp(x)     of floats and duals
-    select(c, x, y)     x where c holds, else y, of floats and duals: for formulas that Triton compiles, too
+    sqrt(x), exp(x)     of floats, duals, and vectors, whose lanes are so many Gaussians
+    select(c, x, y)     x where c holds, else y, of the same: for formulas that Triton compiles, too
 """
 
 # pyright: reportOptionalCall=false
@@ -22,8 +22,10 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin, models, register_model
 
-from splat.backend.cpu.jit import formula
-from splat.backend.cpu.simd import VectorType, intrinsic
+from splat.backend.cpu.exponential import emit_exp
+from splat.backend.cpu.simd import VectorType, call_on_lanes, intrinsic, select
+
+__all__ = ["dual", "exp", "select", "sqrt", "tangent_of", "value_of", "variable"]
 
 CONTRACT = ("contract",)
 
@@ -194,10 +196,12 @@ def variable(typing, array, x, i):
     return result(array, types.float64, i), generate
 
 
-def _unary(llvm_name, derivative):
-    """An intrinsic of floats and duals; derivative(e, x, f(x)) emits f'(x)."""
+def _unary(llvm_name, derivative, of_vector):
+    """An intrinsic of floats, duals and vectors.  derivative(e, x, f(x)) emits f'(x); of_vector(builder, vector, x): f(x)."""
 
     def typed(typing, x):
+        if isinstance(x, VectorType):
+            return x(x), lambda context, builder, sig, args: of_vector(builder, x, args[0])
         number = x.value if isinstance(x, DualType) else x
         suffix = "f32" if number.bitwidth == 32 else "f64"
 
@@ -219,10 +223,9 @@ def _unary(llvm_name, derivative):
     return intrinsic(typed)
 
 
-@formula
-def select(condition, x, y):
-    return x if condition else y
+def _root_of_vector(builder, _vector, x):
+    return call_on_lanes(builder, "sqrt", x)
 
 
-sqrt = _unary("sqrt", lambda e, x, root: e.builder.fdiv(x.type(0.5), root))
-exp = _unary("exp", lambda e, x, power: power)
+sqrt = _unary("sqrt", lambda e, x, root: e.builder.fdiv(x.type(0.5), root), _root_of_vector)
+exp = _unary("exp", lambda e, x, power: power, emit_exp)

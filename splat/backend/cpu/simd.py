@@ -9,9 +9,9 @@ any width and type: the array that a vector is loaded from decides its dtype, an
     iota(a)                         0, 1, 2, ...; here and above, a names the dtype
     x + y, x - y, x * y, x / y, -x  may be contracted to fused multiply-adds by the compiler
     fma(x, y, z)                    x y + z with one rounding, always: for values that decide a comparison
-    minimum(x, y), maximum(x, y), sqrt(x)
-    x < y ..., m & n                masks;  select(m, x, y), of numbers too;  any_lane(m)
-    exp2(x)                         for -126 <= x <= 126 (float32), -1022 <= x <= 1022 (float64); relative error: EXP2_ERROR
+    minimum(x, y), maximum(x, y), min(x, y), max(x, y), abs(x), sqrt(x), floor(x), ceil(x)
+    x < y ..., m & n, m | n         masks;  select(m, x, y), of numbers and duals too;  any_lane(m)
+    load_all(a, i, k), store_all(a, i, t)   a tuple of k vectors, one behind the other; k is a constant
     store_sums(a, i, (v0, ...))     the sum over the lanes of each vector to a[i], a[i+1], ...
     prefetch(a, i)                  hint that a[i] will be read soon; no effect on results
 
@@ -21,6 +21,7 @@ Requires C-contiguous arrays; indices are not checked.
 # pyright: reportOptionalCall=false
 # (numba declares its decorators as None until they are set up)
 
+import math
 import operator
 import os
 from collections.abc import Callable
@@ -30,6 +31,7 @@ import llvmlite.binding
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.errors import RequireLiteralValue
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import lower_builtin, lower_cast, models, register_model
@@ -57,7 +59,7 @@ def _register_bits() -> int:
 
 REGISTER_BITS = _register_bits()
 keep_kernels(REGISTER_BITS)
-I32, I64 = ir.IntType(32), ir.IntType(64)
+I32, I64, F32 = ir.IntType(32), ir.IntType(64), ir.FloatType()
 
 
 def lanes_of(dtype: np.dtype | type) -> int:
@@ -109,24 +111,22 @@ class _MaskModel(models.PrimitiveModel):
         super().__init__(manager, mask, ir.VectorType(ir.IntType(1), mask.lanes))
 
 
-def _splat(builder, vector, scalar):
-    undefined = ir.Constant(vector.llvm, ir.Undefined)
-    first = builder.insert_element(undefined, scalar, I32(0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(I32, vector.lanes), [0] * vector.lanes))
+def splat_of(builder, number, lanes):
+    """A vector with the number in every lane."""
+    undefined = ir.Constant(ir.VectorType(number.type, lanes), ir.Undefined)
+    first = builder.insert_element(undefined, number, I32(0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(I32, lanes), [0] * lanes))
 
 
-def _call(builder, name, result, arguments):
+def call(builder, name, result, arguments):
+    """A call of LLVM's function of this name."""
     function = ir.FunctionType(result, [argument.type for argument in arguments])
     return builder.call(cgutils.get_or_insert_function(builder.module, function, name), arguments)
 
 
-def _suffix(vector) -> str:
-    return f"v{vector.lanes}f{vector.bits}"
-
-
 @lower_cast(types.Number, VectorType)
 def _number_to_vector(context, builder, number, vector, value):
-    return _splat(builder, vector, context.cast(builder, value, number, vector.dtype))
+    return splat_of(builder, context.cast(builder, value, number, vector.dtype), vector.lanes)
 
 
 # --- operators --------------------------------------------------------------------------------------------------------
@@ -164,6 +164,25 @@ def _comparison(symbol):
     return lambda builder, x, y: builder.fcmp_ordered(symbol, x, y)
 
 
+def _least(builder, x, y):
+    return builder.select(builder.fcmp_ordered("<", x, y), x, y)
+
+
+def _greatest(builder, x, y):
+    return builder.select(builder.fcmp_ordered(">", x, y), x, y)
+
+
+def call_on_lanes(builder, name, *vectors):
+    """LLVM's function of this name of every lane."""
+    result = vectors[0].type
+    suffix = f"v{result.count}f{32 if result.element == F32 else 64}"
+    return call(builder, f"llvm.{name}.{suffix}", result, list(vectors))
+
+
+def _of_lanes(name):
+    return lambda builder, x: call_on_lanes(builder, name, x)
+
+
 for _function, _instruction in (
     (operator.add, "fadd"),
     (operator.iadd, "fadd"),
@@ -174,38 +193,54 @@ for _function, _instruction in (
     (operator.truediv, "fdiv"),
 ):
     _register(_function, _arithmetic(_instruction))
-for _function, _symbol in ((operator.ge, ">="), (operator.gt, ">"), (operator.le, "<="), (operator.lt, "<")):
+for _function, _symbol in (
+    (operator.ge, ">="), (operator.gt, ">"), (operator.le, "<="), (operator.lt, "<"), (operator.eq, "==")
+):  # fmt: skip
     _register(_function, _comparison(_symbol), to_mask=True)
+_register(operator.ne, lambda builder, x, y: builder.fcmp_unordered("!=", x, y), to_mask=True)
+_register(min, _least)
+_register(max, _greatest)
 
 
-@infer_global(operator.neg)
-class _Negation(AbstractTemplate):
-    def generic(self, args, kws):
-        return signature(args[0], args[0]) if isinstance(args[0], VectorType) else None
+def _register_of(kind, function, emit) -> None:
+    """Type and lower a function of vectors, or of masks, alone."""
+
+    class Template(AbstractTemplate):
+        key = function
+
+        def generic(self, args, kws):
+            return signature(args[0], *args) if isinstance(args[0], kind) and len(set(args)) == 1 else None
+
+    infer_global(function)(Template)
+
+    @lower_builtin(function, kind)
+    @lower_builtin(function, kind, kind)
+    def lower(context, builder, sig, args):
+        return emit(builder, *args)
 
 
-@lower_builtin(operator.neg, VectorType)
-def _negate(context, builder, sig, args):
-    return builder.fneg(args[0])
-
-
-@infer_global(operator.and_)
-class _Conjunction(AbstractTemplate):
-    def generic(self, args, kws):
-        return signature(args[0], *args) if isinstance(args[0], MaskType) and args[0] == args[1] else None
-
-
-@lower_builtin(operator.and_, MaskType, MaskType)
-def _conjunction(context, builder, sig, args):
-    return builder.and_(*args)
+_register_of(VectorType, operator.neg, lambda builder, x: builder.fneg(x))
+_register_of(MaskType, operator.and_, lambda builder, m, n: builder.and_(m, n))
+_register_of(MaskType, operator.or_, lambda builder, m, n: builder.or_(m, n))
+for _function, _name in ((abs, "fabs"), (math.floor, "floor"), (math.ceil, "ceil")):
+    _register_of(VectorType, _function, _of_lanes(_name))
 
 
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 
-def _address(context, builder, array, value, index, index_type):
-    data = context.make_array(array)(context, builder, value).data
-    return builder.gep(data, [context.cast(builder, index, index_type, types.intp)])
+def address_of(context, builder, sig, args):
+    """Where the array that is the first argument keeps the number whose index is the second."""
+    data = context.make_array(sig.args[0])(context, builder, args[0]).data
+    return builder.gep(data, [context.cast(builder, args[1], sig.args[1], types.intp)])
+
+
+def load_at(builder, address, vector, further=0):
+    """The vector so many numbers behind an address."""
+    address = builder.gep(address, [I64(further)])
+    value = builder.load(builder.bitcast(address, vector.llvm.as_pointer()))
+    value.align = vector.bits // 8
+    return value
 
 
 @intrinsic
@@ -213,10 +248,7 @@ def load(typing, array, index):
     vector = VectorType(array.dtype)
 
     def generate(context, builder, sig, args):
-        address = _address(context, builder, sig.args[0], args[0], args[1], sig.args[1])
-        value = builder.load(builder.bitcast(address, vector.llvm.as_pointer()))
-        value.align = vector.bits // 8
-        return value
+        return load_at(builder, address_of(context, builder, sig, args), vector)
 
     return vector(array, index), generate
 
@@ -226,7 +258,7 @@ def store(typing, array, index, value):
     vector = value if isinstance(value, VectorType) else VectorType(array.dtype)
 
     def generate(context, builder, sig, args):
-        address = _address(context, builder, sig.args[0], args[0], args[1], sig.args[1])
+        address = address_of(context, builder, sig, args)
         done = builder.store(args[2], builder.bitcast(address, vector.llvm.as_pointer()))
         done.align = vector.bits // 8
         return context.get_dummy_value()
@@ -235,12 +267,24 @@ def store(typing, array, index, value):
 
 
 @intrinsic
+def load_all(typing, array, index, count):
+    if not isinstance(count, types.IntegerLiteral):
+        raise RequireLiteralValue("expected a constant number of vectors")
+    many = types.UniTuple(VectorType(array.dtype), count.literal_value)
+
+    def generate(context, builder, sig, args):
+        address, vector = address_of(context, builder, sig, args), many.dtype
+        values = [load_at(builder, address, vector, k * vector.lanes) for k in range(many.count)]
+        return context.make_tuple(builder, many, values)
+
+    return many(array, index, count), generate
+
+
+@intrinsic
 def prefetch(typing, array, index):
     def generate(context, builder, sig, args):
-        address = builder.bitcast(
-            _address(context, builder, sig.args[0], args[0], args[1], sig.args[1]), ir.IntType(8).as_pointer()
-        )
-        _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, I32(0), I32(3), I32(1)])
+        address = builder.bitcast(address_of(context, builder, sig, args), ir.IntType(8).as_pointer())
+        call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, I32(0), I32(3), I32(1)])
         return context.get_dummy_value()
 
     return types.void(array, index), generate
@@ -252,7 +296,7 @@ def store_sums(typing, array, index, vectors):
     vector = VectorType(array.dtype)
 
     def generate(context, builder, sig, args):
-        address = _address(context, builder, sig.args[0], args[0], args[1], sig.args[1])
+        address = address_of(context, builder, sig, args)
         values = cgutils.unpack_tuple(builder, args[2])
         for start in range(0, len(values), 4):
             group = values[start : start + 4]
@@ -316,10 +360,7 @@ def fma(typing, x, y, z):
     if vector is None:
         return None
 
-    def generate(context, builder, sig, args):
-        return _call(builder, f"llvm.fma.{_suffix(vector)}", vector.llvm, list(args))
-
-    return vector(vector, vector, vector), generate
+    return vector(vector, vector, vector), lambda context, builder, sig, args: call_on_lanes(builder, "fma", *args)
 
 
 @intrinsic
@@ -328,10 +369,7 @@ def minimum(typing, x, y):
     if vector is None:
         return None
 
-    def generate(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered("<", *args), *args)
-
-    return vector(vector, vector), generate
+    return vector(vector, vector), lambda context, builder, sig, args: _least(builder, *args)
 
 
 @intrinsic
@@ -340,10 +378,7 @@ def maximum(typing, x, y):
     if vector is None:
         return None
 
-    def generate(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered(">", *args), *args)
-
-    return vector(vector, vector), generate
+    return vector(vector, vector), lambda context, builder, sig, args: _greatest(builder, *args)
 
 
 @intrinsic
@@ -356,10 +391,7 @@ def select(typing, mask, x, y):
 
 @intrinsic
 def sqrt(typing, x):
-    def generate(context, builder, sig, args):
-        return _call(builder, f"llvm.sqrt.{_suffix(x)}", x.llvm, list(args))
-
-    return x(x), generate
+    return x(x), lambda context, builder, sig, args: _of_lanes("sqrt")(builder, *args)
 
 
 @intrinsic
@@ -369,41 +401,6 @@ def any_lane(typing, mask):
         return builder.icmp_unsigned("!=", builder.bitcast(args[0], bits), ir.Constant(bits, 0))
 
     return types.boolean(mask), generate
-
-
-def _exp2_polynomial(bits: int) -> tuple[np.ndarray, float]:
-    """Coefficients of 2^f on |f| <= 1/2, close to minimax in relative error, 2^0 = 1 exactly; and the error reached."""
-    degree = 5 if bits == 32 else 11
-    nodes = np.cos(np.pi * (np.arange(200) + 0.5) / 200) / 2
-    powers = np.stack([nodes**k for k in range(1, degree + 1)], axis=1) / np.exp2(nodes)[:, None]
-    rest = np.linalg.lstsq(powers, 1 - np.exp2(-nodes), rcond=None)[0]
-    coefficients = np.concatenate([[1.0], rest])
-    grid = np.linspace(-0.5, 0.5, 10001)
-    return coefficients, float(np.abs(np.polyval(coefficients[::-1], grid) / np.exp2(grid) - 1).max())
-
-
-EXP2 = {bits: _exp2_polynomial(bits) for bits in (32, 64)}
-EXP2_ERROR = {bits: error for bits, (_, error) in EXP2.items()}
-
-
-@intrinsic
-def exp2(typing, x):
-    # Adding 1.5 x 2^(mantissa bits) rounds to the nearest integer and leaves it in the low bits of the sum.
-    shift = 23 if x.bits == 32 else 52
-    magic = x.constant(1.5 * 2.0**shift)
-
-    def generate(context, builder, sig, args):
-        shifted = builder.fadd(args[0], magic)
-        fraction = builder.fsub(args[0], builder.fsub(shifted, magic))
-        coefficients = EXP2[x.bits][0]
-        value = x.constant(coefficients[-1])
-        for c in coefficients[-2::-1]:
-            value = _call(builder, f"llvm.fma.{_suffix(x)}", x.llvm, [value, fraction, x.constant(c)])
-        whole = builder.bitcast(shifted, x.integers_ir)
-        exponent = builder.shl(whole, ir.Constant(x.integers_ir, [shift] * x.lanes))
-        return builder.bitcast(builder.add(builder.bitcast(value, x.integers_ir), exponent), x.llvm)
-
-    return x(x), generate
 
 
 @intrinsic

@@ -157,7 +157,7 @@ PRIMITIVES: dict[str, Callable] = {
     "value_of": _value_of, "select": select, "fma": _fma, "reciprocal": _reciprocal, "sqrt": _sqrt, "exp": _exp,
     "maximum": _maximum, "max": lambda *numbers: reduce(_maximum, numbers), "minimum": _minimum, "min": _minimum,
     "abs": _elementwise(tl.abs), "log": _elementwise(tl.log), "exp2": _elementwise(tl.exp2), "ceil": _elementwise(tl.ceil),
-    "floor": _elementwise(tl.floor), "int": lambda x: Number(x.semantic, x._emit("to", x.value, tl.int32)),
+    "floor": _elementwise(tl.floor),
 }  # fmt: skip
 
 

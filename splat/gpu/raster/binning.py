@@ -90,6 +90,7 @@ def count_strips(
     ellipse = ellipse_of(splat, tl.load(limits), tl.load(limits + 1))
     x0, x1, y0, y1 = box_of(splat, ellipse, width, height)
     some = (x0 <= x1) & (y0 <= y1) & (tl.load(drawn + s, inside, other=0) != 0)
+    x0, x1 = x0.to(tl.int32), x1.to(tl.int32)
     tl.store(first + i, x0 // WIDTH, inside)
     tl.store(count + i, tl.where(some, x1 // WIDTH - x0 // WIDTH + 1, 0), inside)
 
@@ -109,6 +110,7 @@ def count_rows(
     )
     ellipse = ellipse_of(splat, tl.load(limits), tl.load(limits + 1))
     y0, y1 = rows_of_strip(splat, ellipse, column, WIDTH, width, height)
+    y0, y1 = y0.to(tl.int32), y1.to(tl.int32)
     tl.store(first + i, y0 // HEIGHT * columns + column, inside)
     tl.store(count + i, tl.where(y0 <= y1, y1 // HEIGHT - y0 // HEIGHT + 1, 0), inside)
 

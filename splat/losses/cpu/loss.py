@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from splat.backend.cpu.planes import TILE_ROWS, aligned
+from splat.backend.cpu.memory import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
 from splat.losses.cpu.sweeps import (

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.planes import scratch
+from splat.backend.cpu.memory import scratch
 from splat.backend.cpu.simd import lanes, load, store
 from splat.losses.reference import REACH
 

@@ -5,14 +5,16 @@ A splat is drawn where its alpha is at least alpha_min, inside the ellipse a dx^
 double precision and rounded outwards.  Splats: (n, 9), as in `projection/whitening.py`.
 """
 
+from math import floor
+
 import numpy as np
 
 from splat.backend.cpu.jit import kernel
-from splat.backend.cpu.planes import TILE_ROWS
-from splat.backend.cpu.simd import lanes_of
+from splat.backend.cpu.memory import TILE_ROWS, gather, scatter, scratch, store_all
+from splat.backend.cpu.simd import lanes, lanes_of, load_all, select
 from splat.backend.cpu.threads import over_range
 from splat.render.cpu.tile import Lists
-from splat.render.formulas import Thresholds, box_of, ellipse_of, rows_of_strip
+from splat.render.formulas import SPLAT, Thresholds, box_of, ellipse_of, rows_of_strip
 
 RADIX_BITS = 11
 
@@ -47,42 +49,42 @@ def radix_argsort(keys, index):
     return index
 
 
-@kernel
-def count_tiles(start, stop, splats, order, tile, width, height, alpha_min, contour, bound):
-    """An upper bound of the number of tiles each splat touches: those of its ellipse's box."""
-    for i in range(start, stop):
-        splat = splats[order[i]]
-        x0, x1, y0, y1 = box_of(splat, ellipse_of(splat, alpha_min, contour), width, height)
-        bound[i] = 0
-        if x0 <= x1 and y0 <= y1:
-            bound[i] = (x1 // tile - x0 // tile + 1) * (y1 // TILE_ROWS - y0 // TILE_ROWS + 1)
+BOX = 7  # numbers of a box: those of `ellipse_of`; first and last column of tiles; number of tiles
+BOX_AT, ROWS = 16, 24  # rows of a block of splats
 
 
 @kernel
-def list_tiles(start, stop, splats, order, tile, columns, width, height, alpha_min, contour, place, count, tiles, rows):
+def find_boxes(start, stop, splats, tile, width, height, alpha_min, contour, boxes):
+    """Fill boxes (n, BOX)."""
+    block, across, down = scratch(np.empty(0), ROWS * lanes(np.empty(0))), 1 / tile, 1 / TILE_ROWS
+    for i in range(start, stop, lanes(block)):
+        gather(splats, SPLAT, i, stop, block, 0)
+        splat = load_all(block, 0, 6)
+        ellipse = ellipse_of(splat, alpha_min, contour)
+        x0, x1, y0, y1 = box_of(splat, ellipse, width, height)
+        first, last = floor(x0 * across), floor(x1 * across)
+        tiles = (last - first + 1.0) * (floor(y1 * down) - floor(y0 * down) + 1.0)
+        store_all(block, BOX_AT, (*ellipse, first, last, select((x0 <= x1) & (y0 <= y1), tiles, 0.0)))
+        scatter(block, BOX_AT, boxes, BOX, i, stop)
+
+
+@kernel
+def list_tiles(start, stop, splats, order, boxes, tile, columns, width, height, place, count, tiles, rows):
     """The tiles that each splat touches and its rows in them, at place[i], place[i] + 1, ...; count[i] of them."""
     for i in range(start, stop):
-        count[i] = 0
-        if place[i + 1] > place[i]:
-            own_tiles, own_rows = tiles[place[i] :], rows[place[i] :]
-            splat = splats[order[i]]
-            count[i] = list_splat(splat, tile, columns, width, height, alpha_min, contour, own_tiles, own_rows)
-
-
-@kernel
-def list_splat(splat, tile, columns, width, height, alpha_min, contour, tiles, rows):
-    ellipse = ellipse_of(splat, alpha_min, contour)
-    x0, x1, _y0, _y1 = box_of(splat, ellipse, width, height)
-    k = 0
-    for column in range(x0 // tile, x1 // tile + 1):
-        y0, y1 = rows_of_strip(splat, ellipse, column, tile, width, height)
-        if y0 <= y1:
-            for row in range(y0 // TILE_ROWS, y1 // TILE_ROWS + 1):
-                top, bottom = max(y0 - row * TILE_ROWS, 0), min(y1 - row * TILE_ROWS, TILE_ROWS - 1)
-                tiles[k] = row * columns + column
-                rows[k] = top | bottom << 8
-                k += 1
-    return k
+        s, k = order[i], place[i]
+        if place[i + 1] > k:
+            splat = (splats[s, 0], splats[s, 1], splats[s, 2], splats[s, 3], splats[s, 4])
+            ellipse = (boxes[s, 0], boxes[s, 1], boxes[s, 2], boxes[s, 3])
+            for column in range(int(boxes[s, 4]), int(boxes[s, 5]) + 1):
+                y0, y1 = rows_of_strip(splat, ellipse, column, tile, width, height)
+                if y0 <= y1:
+                    for row in range(y0 // TILE_ROWS, y1 // TILE_ROWS + 1):
+                        top, bottom = max(y0 - row * TILE_ROWS, 0), min(y1 - row * TILE_ROWS, TILE_ROWS - 1)
+                        tiles[k] = row * columns + column
+                        rows[k] = top | bottom << 8
+                        k += 1
+        count[i] = k - place[i]
 
 
 @kernel
@@ -111,14 +113,13 @@ def bin_splats(
     columns = -(-width // tile)
     tile_count = columns * -(-height // TILE_ROWS)
     order = depth_order(depths, drawn)
-    where = (tile, width, height, thresholds.alpha_min, thresholds.contour)
-    bound = np.empty(order.size, np.int64)
-    over_range(order.size, count_tiles, splats, order, *where, bound)
-    place = np.zeros(order.size + 1, np.int64)
-    np.cumsum(bound, out=place[1:])
+    boxes, limits = np.empty((len(splats), BOX)), (thresholds.alpha_min, thresholds.contour)
+    over_range(len(splats), find_boxes, splats, tile, width, height, *limits, boxes)
+    place = np.zeros(order.size + 1, np.int64)  # room for all tiles of each box
+    np.cumsum(boxes[order, BOX - 1], out=place[1:], dtype=np.int64)
     count = np.empty(order.size, np.int32)
     tiles, rows = np.empty(place[-1], np.int32), np.empty(place[-1], np.int32)
-    over_range(order.size, list_tiles, splats, order, tile, columns, *where[1:], place, count, tiles, rows)
+    over_range(order.size, list_tiles, splats, order, boxes, tile, columns, width, height, place, count, tiles, rows)
     intersections, start = int(count.sum()), np.empty(tile_count + 1, np.int64)
     splat_of, rows_of = np.empty(intersections, np.int32), np.empty(intersections, np.int32)
     fill_lists(order, place, count, tiles, rows, start, splat_of, rows_of)

@@ -20,7 +20,7 @@ Where the cap holds, q is constant: only c c is left.
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.planes import TILE_ROWS, scratch
+from splat.backend.cpu.memory import TILE_ROWS, scratch
 from splat.backend.cpu.simd import broadcast, lanes, load, prefetch, store, store_sums
 from splat.render.cpu.tile import (
     BEHIND,

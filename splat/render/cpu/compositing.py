@@ -19,7 +19,7 @@ v_x      cotangent: the loss's derivative in x
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.planes import TILE_ROWS, scratch
+from splat.backend.cpu.memory import TILE_ROWS, scratch
 from splat.backend.cpu.simd import any_lane, fma, lanes, load, maximum, prefetch, select, store
 from splat.render.cpu.tile import (
     AHEAD,

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.planes import TILE_ROWS, scratch
+from splat.backend.cpu.memory import TILE_ROWS, scratch
 from splat.backend.cpu.simd import broadcast, fetch_and_increment, iota, lanes, load, select, store, store_sums
 from splat.losses.formulas import CENTRE, ssim_second_dot
 from splat.losses.reference import REACH, window

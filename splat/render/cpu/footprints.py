@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.planes import TILE_ROWS, scratch
+from splat.backend.cpu.memory import TILE_ROWS, scratch
 from splat.backend.cpu.simd import broadcast, iota, lanes, load, maximum, select, store
 from splat.render.cpu.tile import (
     BEHIND,

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from splat.backend.cpu.planes import TILE_ROWS, aligned
+from splat.backend.cpu.memory import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range, over_tiles
 from splat.losses.cpu.loss import CpuLinearLoss

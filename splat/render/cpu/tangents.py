@@ -9,7 +9,7 @@ those of a tangent K times.
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.planes import TILE_ROWS, scratch
+from splat.backend.cpu.memory import TILE_ROWS, scratch
 from splat.backend.cpu.simd import fma, lanes, load, prefetch, select, store
 from splat.render.cpu.compositing import begin_backward_row
 from splat.render.cpu.tile import (

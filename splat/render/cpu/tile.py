@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splat.backend.cpu.jit import formula
-from splat.backend.cpu.planes import TILE_ROWS
+from splat.backend.cpu.memory import TILE_ROWS
 from splat.backend.cpu.simd import (
     any_lane,
     broadcast,

@@ -38,16 +38,21 @@ def everything(gaussians: Gaussians, camera: Camera, backend: Backend, settings:
     return {name: value.detach() for name, value in zip(names, values, strict=True)}
 
 
+def require_agreement(gaussians: Gaussians, camera: Camera, settings: RenderSettings, dtype=torch.float64) -> None:
+    got = everything(gaussians.to(dtype), camera, "kernels", settings)
+    expected = everything(gaussians, camera, "reference", settings)
+    for name in ("image", "alpha", "depth"):
+        assert got[name].dtype == dtype and relative_error(got[name], expected[name]) < IMAGE[dtype], name
+    for name in ("gradient", "product"):
+        errors = errors_by_block(got[name], expected[name], gaussians.blocks)
+        assert max(errors.values()) < DERIVATIVE[dtype], (name, errors)
+
+
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 @pytest.mark.parametrize("settings", [RenderSettings(), SMOOTH], ids=["default", "smooth"])
 def test_kernels_and_plain_torch_agree_to_the_second_derivative(size, settings):
     gaussians, camera = random_gaussians(40, 3, logit=1.0), random_camera(*size, focal=30.0)
-    got, expected = (everything(gaussians, camera, backend, settings) for backend in ("kernels", "reference"))
-    for name in ("image", "alpha", "depth"):
-        assert relative_error(got[name], expected[name]) < IMAGE[torch.float64], name
-    for name in ("gradient", "product"):
-        errors = errors_by_block(got[name], expected[name], gaussians.blocks)
-        assert max(errors.values()) < DERIVATIVE[torch.float64], (name, errors)
+    require_agreement(gaussians, camera, settings)
 
 
 SWITCHES = {
@@ -61,12 +66,7 @@ def test_kernels_and_plain_torch_agree_for_every_combination_of_settings(values)
     settings = RenderSettings(**dict(zip(SWITCHES, values, strict=True)))
     gaussians, camera = random_gaussians(20, 1, logit=5.0), random_camera(36, 24, focal=60.0)
     gaussians.log_scales.sub_(1.0)  # far from a splat its alpha underflows
-    got, expected = (everything(gaussians, camera, backend, settings) for backend in ("kernels", "reference"))
-    for name in ("image", "alpha", "depth"):
-        assert relative_error(got[name], expected[name]) < IMAGE[torch.float64], name
-    for name in ("gradient", "product"):
-        errors = errors_by_block(got[name], expected[name], gaussians.blocks)
-        assert max(errors.values()) < DERIVATIVE[torch.float64], (name, errors)
+    require_agreement(gaussians, camera, settings)
 
 
 @pytest.mark.parametrize("logit", [0.0, 5.0])
@@ -81,12 +81,7 @@ def test_training_and_probe_see_the_same_image_to_the_last_bit(logit):
 
 def test_float32_renders_and_differentiates_within_its_tolerance():
     gaussians, camera = random_gaussians(40, 3, logit=-1.0), random_camera(focal=30.0)
-    got = everything(gaussians.to(torch.float32), camera, "kernels", SMOOTH)
-    expected = everything(gaussians, camera, "reference", SMOOTH)
-    for name in ("image", "alpha", "depth"):
-        assert got[name].dtype == torch.float32 and relative_error(got[name], expected[name]) < IMAGE[torch.float32]
-    for name in ("gradient", "product"):
-        assert max(errors_by_block(got[name], expected[name], gaussians.blocks).values()) < DERIVATIVE[torch.float32]
+    require_agreement(gaussians, camera, SMOOTH, torch.float32)
 
 
 def test_depth_without_colours_is_that_of_a_whole_render():

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from analysis.bench.stress import PIXELS_ALONE, WITH_SSIM, Case, objective_of, set_rows
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
-from splat.backend.cpu.simd import EXP2_ERROR
+from splat.backend.cpu.exponential import EXP2_ERROR
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from math import ceil, floor
 from pathlib import Path
 
 import numba
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 
 from splat.backend.cpu import kernel_cache, simd
+from splat.backend.cpu.dual import exp
+from splat.backend.cpu.exponential import EXP2_ERROR, exp2, log
+from splat.backend.cpu.memory import gather, neighbours, scatter
 from splat.backend.cpu.simd import (
     any_lane,
     broadcast,
-    exp2,
     fetch_and_increment,
     fma,
     iota,
@@ -31,7 +34,7 @@ from splat.backend.cpu.simd import (
 
 each_dtype = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 BITS = ("128", "256", "512")
-OPERATIONS = 14
+OPERATIONS = 20
 
 
 @numba.njit
@@ -57,6 +60,13 @@ def every_operation(a, b, c, number, out):
     x *= z
     x -= 1.0
     store(out, 13 * L, x)
+    x = load(a, 1)
+    store(out, 14 * L, min(x, y))
+    store(out, 15 * L, max(number, x))
+    store(out, 16 * L, abs(x - y))
+    store(out, 17 * L, floor(3 * x))
+    store(out, 18 * L, ceil(-3 * x))
+    store(out, 19 * L, select((x == x) & ((x > y) | (x != x)), x, y))
 
 
 @numba.njit
@@ -97,7 +107,8 @@ def test_every_operation_is_that_of_numpy_to_the_last_bit(dtype):
     expected = [
         x + y, x - number, 3 * x, number / x, -x, x * y + z, np.minimum(x, y), np.maximum(x, number), np.sqrt(x),
         np.where((x < y) & (x >= z), x, 0), np.where(x > y, y, x), np.where(x <= y, y, x), np.arange(L) + 2,
-        (x + y) * z - 1,
+        (x + y) * z - 1, np.minimum(x, y), np.maximum(x, number), abs(x - y), np.floor(3 * x), np.ceil(-3 * x),
+        np.maximum(x, y),
     ]  # fmt: skip
     fused = (5, 13)  # rounded once fewer than by NumPy; their terms are below 4
     for i, (got, want) in enumerate(zip(out.reshape(OPERATIONS, L), expected, strict=True)):
@@ -122,13 +133,68 @@ def test_exp2_has_its_stated_error_over_its_whole_range(dtype):
     powers(x, out)
     exact = np.exp2(x.astype(np.longdouble))
     # Horner's five or eleven fused steps on |f| <= 1/2 round by less than 1.5 units in the last place together
-    bound = simd.EXP2_ERROR[bits] + 1.5 * np.finfo(dtype).eps
+    bound = EXP2_ERROR[bits] + 1.5 * np.finfo(dtype).eps
     assert np.abs(out / exact - 1).max() < bound
     whole = np.arange(-end, end + 1 + (-2 * end - 1) % 16, dtype=dtype)[: (2 * end + 1) // 16 * 16]
     out = np.empty_like(whole)
     powers(whole, out)
     assert (out == np.exp2(whole)).all()
     assert bound < (3e-7 if bits == 32 else 1e-15)
+
+
+@numba.njit
+def powers_and_logarithms(x, power, y, logarithm):
+    for i in range(0, x.size, lanes(x)):
+        store(power, i, exp(load(x, i)))
+        store(logarithm, i, log(load(y, i)))
+
+
+def test_exp_and_log_are_right_to_a_unit_in_the_last_place():
+    x = np.append(np.linspace(-708.3, 708.3, 4088), [-1e4, -709, -1e-300, 0, 1e-300, 1, 709, 1e4])
+    y = np.append(np.exp(x[:-8]), [0.5, 1, 2, 0.7071067811865475, 1 - 2**-53, 1 + 2**-52, 2.3e-308, np.inf])
+    power, logarithm = np.empty_like(x), np.empty_like(y)
+    powers_and_logarithms(x, power, y, logarithm)
+    inside, eps = abs(x) < 708.35, np.finfo(np.float64).eps
+    assert abs(power[inside] / np.exp(x[inside].astype(np.longdouble)) - 1).max() < 1.25 * eps
+    assert not power[x < -708.4].any() and (power[x > 708.4] > 1e307).all() and np.isfinite(power).all()
+    assert logarithm[-1] == np.inf and logarithm[y == 1] == 0
+    exact = np.log(y[:-1].astype(np.longdouble))
+    assert (abs(logarithm[:-1] - exact) <= 1.25 * eps * abs(exact)).all()
+
+
+@numba.njit
+def through_lanes(numbers, k, block, out, stop):
+    for i in range(0, stop, lanes(block)):
+        gather(numbers, k, i, stop, block, 0)
+        scatter(block, 0, out, k, i, stop)
+
+
+@each_dtype
+@pytest.mark.parametrize("k", [1, 3, 9, 27])
+@pytest.mark.parametrize("n", [1, 5, 17])
+def test_rows_go_into_lanes_and_back_and_no_further(dtype, k, n):
+    numbers, block = np.random.default_rng(0).random((n + 1, k), dtype), np.zeros(40 * lanes_of(np.float64))
+    out = np.full_like(numbers, -1)
+    through_lanes(numbers, k, block, out, n)
+    assert (out[:n] == numbers[:n]).all() and (out[n:] == -1).all()
+    L = lanes_of(np.float64)
+    last = np.minimum((n - 1) // L * L + np.arange(L), n - 1)  # in the last block, a row of a number each
+    assert (block.reshape(40, L)[:k] == numbers[last].T).all()
+
+
+@numba.njit
+def all_around(a, at, out):
+    found = neighbours(a, at)
+    for j in range(10):
+        store(out, j * lanes(a), found[j])
+
+
+@each_dtype
+def test_neighbours_are_those_to_the_right_then_those_to_the_left(dtype):
+    L = lanes_of(dtype)
+    a, out, at = np.arange(16 * L, dtype=dtype), np.empty(10 * L, dtype), 8 * L
+    all_around(a, at, out)
+    assert (out.reshape(10, L) == at + np.arange(L) + np.array([[1, 2, 3, 4, 5, -1, -2, -3, -4, -5]]).T).all()
 
 
 @each_dtype

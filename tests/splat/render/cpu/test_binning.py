@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splat.backend.cpu.planes import TILE_ROWS
+from splat.backend.cpu.memory import TILE_ROWS
 from splat.backend.cpu.simd import lanes_of
 from splat.model.settings import RenderSettings
 from splat.render.cpu.binning import bin_splats, depth_order, heaviest_first, radix_argsort

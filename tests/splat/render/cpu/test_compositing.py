@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splat.backend.cpu.planes import TILE_ROWS
+from splat.backend.cpu.memory import TILE_ROWS
 from splat.backend.cpu.simd import lanes_of
 from splat.model.settings import RenderSettings
 from splat.render.backend import plain_gradient
@@ -151,7 +151,7 @@ def test_tiles_with_a_cotangent_of_zero_are_left_out_and_add_nothing(monkeypatch
     def poisoned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
         return np.full(shape, np.nan, dtype)
 
-    monkeypatch.setattr("splat.backend.cpu.planes.aligned", poisoned)  # what a tile leaves unwritten shows
+    monkeypatch.setattr("splat.backend.cpu.memory.aligned", poisoned)  # what a tile leaves unwritten shows
     expected = truth("typical")
     raster = expected.raster(torch.float64)
     tangent = plain_jvp(raster, expected.U[:, :K])

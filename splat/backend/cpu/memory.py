@@ -1,0 +1,189 @@
+"""Arrays that start on a cache line, the height of a tile of pixels, and rows of numbers in the lanes of vectors.
+
+A block holds a few things, such as Gaussians, a thing in each lane of float64: a row of lanes for each of its numbers.  Its
+rows are transposed in registers, as many at a time as there are lanes:
+
+    load_rows(a, at, k, last, count, block, row)     number j of thing l, a[at + l k + j], to lane l of row + j of the block;
+                                                     l = last for l beyond it, and 0 for j from `count` on
+    store_rows(a, at, k, last, count, block, row)    the other way; numbers from `count` on stay as they are
+    neighbours(a, at)                                vectors of a[at + t], t = 1, ..., 5, -1, ..., -5; `at` aligned
+
+a: an array of floats, C-contiguous; `at` counts its numbers.
+"""
+
+# pyright: reportOptionalCall=false
+# (numba declares its decorators as None until they are set up)
+
+import numpy as np
+from llvmlite import ir
+from numba.core import types
+
+from splat.backend.cpu.jit import formula
+from splat.backend.cpu.simd import (
+    I32,
+    I64,
+    VectorType,
+    address_of,
+    call,
+    intrinsic,
+    lanes,
+    load_at,
+    select,
+    splat_of,
+    store,
+)
+
+TILE_ROWS = 16
+
+
+@formula
+def scratch(like, size):
+    """A new array of like's dtype that starts on a cache line."""
+    buffer = np.empty(size + 16, like.dtype)
+    start = ((64 - (buffer.ctypes.data & 63)) & 63) // buffer.itemsize
+    return buffer[start : start + size]
+
+
+def aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An uninitialised array that starts on a cache line."""
+    size, item = int(np.prod(shape)), np.dtype(dtype).itemsize
+    buffer = np.empty(size * item + 64, np.uint8)
+    start = -buffer.ctypes.data % 64
+    return buffer[start : start + size * item].view(dtype).reshape(shape)
+
+
+def _transposed(builder, rows):
+    """Vectors of as many lanes as there are vectors, transposed: by exchanges of lanes whose numbers differ in one bit."""
+    L, rows = len(rows), list(rows)
+    step = 1
+    while step < L:
+        low = [lane if not lane & step else L + lane - step for lane in range(L)]
+        high = [lane + step if not lane & step else L + lane for lane in range(L)]
+        masks = [ir.Constant(ir.VectorType(I32, L), places) for places in (low, high)]
+        for r in (r for r in range(L) if not r & step):
+            pair = rows[r], rows[r | step]
+            rows[r], rows[r | step] = (builder.shuffle_vector(*pair, mask) for mask in masks)
+        step *= 2
+    return rows
+
+
+class _Rows:
+    """Addresses of rows of an array and of a block, and the mask of the numbers that count; arguments as of `load_rows`."""
+
+    def __init__(self, context, builder, sig, args):
+        array, block = sig.args[0], sig.args[5]
+        at, k, last, count, row = (context.cast(builder, args[j], sig.args[j], types.intp) for j in (1, 2, 3, 4, 6))
+        self.builder, self.wide = builder, VectorType(types.float64)
+        L, self.narrow = self.wide.lanes, VectorType(array.dtype, self.wide.lanes)
+        numbers = ir.Constant(ir.VectorType(I64, L), list(range(L)))
+        self.mask = builder.icmp_signed("<", numbers, splat_of(builder, count, L))
+        self.addresses, self.block = [], []
+        for l in range(L):
+            thing = builder.select(builder.icmp_signed("<", last, I64(l)), last, I64(l))
+            places = builder.add(at, builder.mul(thing, k)), builder.mul(builder.add(row, I64(l)), I64(L))
+            for found, kind, value, place, vector in (
+                (self.addresses, array, args[0], places[0], self.narrow), (self.block, block, args[5], places[1], self.wide)
+            ):  # fmt: skip
+                data = context.make_array(kind)(context, builder, value).data
+                found.append(builder.bitcast(builder.gep(data, [place]), vector.llvm.as_pointer()))
+
+    def masked(self, name, result, *arguments):
+        """LLVM's masked load or store."""
+        name = f"llvm.masked.{name}.v{self.narrow.lanes}f{self.narrow.bits}.p0"
+        return call(self.builder, name, result, arguments)
+
+
+@intrinsic
+def load_rows(typing, array, at, k, last, count, block, row):
+    def generate(context, builder, sig, args):
+        rows = _Rows(context, builder, sig, args)
+        narrow, size, zero = rows.narrow.llvm, I32(rows.narrow.bits // 8), rows.narrow.constant(0)
+        found = [rows.masked("load", narrow, address, size, rows.mask, zero) for address in rows.addresses]
+        for value, address in zip(_transposed(builder, found), rows.block, strict=True):
+            if rows.narrow.bits == 32:
+                value = builder.fpext(value, rows.wide.llvm)
+            builder.store(value, address).align = 8
+        return context.get_dummy_value()
+
+    return types.void(array, at, k, last, count, block, row), generate
+
+
+@intrinsic
+def store_rows(typing, array, at, k, last, count, block, row):
+    def generate(context, builder, sig, args):
+        rows, found = _Rows(context, builder, sig, args), []
+        for address in rows.block:
+            found.append(builder.load(address))
+            found[-1].align = 8
+        if rows.narrow.bits == 32:
+            found = [builder.fptrunc(value, rows.narrow.llvm) for value in found]
+        for value, address in zip(_transposed(builder, found), rows.addresses, strict=True):
+            rows.masked("store", ir.VoidType(), value, address, I32(rows.narrow.bits // 8), rows.mask)
+        return context.get_dummy_value()
+
+    return types.void(array, at, k, last, count, block, row), generate
+
+
+@intrinsic
+def neighbours(typing, array, at):
+    """A vector across the border of two cache lines is slow to load: these are put together from three that are not."""
+    vector, steps = VectorType(array.dtype), [*range(1, 6), *range(-1, -6, -1)]
+    many = types.UniTuple(vector, len(steps))
+
+    def generate(context, builder, sig, args):
+        L, address = vector.lanes, address_of(context, builder, sig, args)
+
+        def near(step):
+            value = load_at(builder, address, vector, step)
+            return builder.bitcast(value, vector.integers_ir)  # LLVM aligns integers alone in one instruction
+
+        def shifted(step):
+            low, high, first = (here, after, step) if step > 0 else (before, here, L + step)
+            return builder.shuffle_vector(low, high, ir.Constant(ir.VectorType(I32, L), [first + l for l in range(L)]))
+
+        before, here, after = near(-L), near(0), near(L)
+        values = [near(step) if max(steps) > L else shifted(step) for step in steps]
+        return context.make_tuple(builder, many, [builder.bitcast(value, vector.llvm) for value in values])
+
+    return many(array, at), generate
+
+
+@formula
+def gather(numbers, k, i, stop, block, row):
+    """Copy the k numbers of each Gaussian, (n, ...), to k rows of the block; lanes beyond the last Gaussian repeat it."""
+    for j in range(0, k, lanes(block)):
+        load_rows(numbers, i * k + j, k, stop - 1 - i, k - j, block, row + j)
+
+
+@formula
+def scatter(block, row, numbers, k, i, stop):
+    """Copy k rows of the block to the numbers of each Gaussian, (n, ...)."""
+    for j in range(0, k, lanes(block)):
+        store_rows(numbers, i * k + j, k, stop - 1 - i, k - j, block, row + j)
+
+
+@formula
+def gather_one(numbers, i, stop, block, row):
+    """Copy a number of each Gaussian, (n,), to a row of the block."""
+    for l in range(lanes(block)):
+        block[row * lanes(block) + l] = numbers[min(i + l, stop - 1)]
+
+
+@formula
+def scatter_one(block, row, numbers, i, stop):
+    for l in range(min(lanes(block), stop - i)):
+        numbers[i + l] = block[row * lanes(block) + l]
+
+
+@formula
+def store_all(block, row, numbers):
+    """Store a tuple of vectors in rows of the block."""
+    for j in range(len(numbers)):
+        store(block, (row + j) * lanes(block), numbers[j])
+
+
+@formula
+def store_where(mask, block, row, numbers):
+    """Store a tuple of vectors in rows of the block, 0 where the mask does not hold."""
+    for j in range(len(numbers)):
+        store(block, (row + j) * lanes(block), select(mask, numbers[j], 0.0))
