@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import TILE_ROWS, scratch
+from splat.backend.cpu.memory import TILE_ROWS, neighbours, scratch
 from splat.backend.cpu.simd import broadcast, fetch_and_increment, iota, lanes, load, select, store, store_sums
 from splat.losses.formulas import CENTRE, ssim_second_dot
 from splat.losses.reference import REACH, window
@@ -38,7 +38,8 @@ POWERS = 4  # fields of each factor: D, D v, D v^2, w
 FIELDS = FACTORS * POWERS
 SLOPES = 7  # of a channel in a splat's numbers, in the order of its block: six of geometry, one of colour
 PAIRS = SLOPES * (SLOPES + 1) // 2
-RING = 16  # rows: a power of two, at least the window's 2 REACH + 1
+TOGETHER = 4  # rows of windows that are blurred in one go
+RING = 16  # rows: a power of two, at least the window's 2 REACH and TOGETHER
 EDGE = 16  # floats of padding at either side of a row: at least a vector, and REACH
 FLUSH = 16  # rows
 MIDDLE, *TAPS = (float(tap) for tap in window(torch.float64)[REACH:])
@@ -55,7 +56,7 @@ def coupled_blocks(counter, index, params, frame, size, footprints, image, targe
     """
     L = lanes(params)
     widest = FIELDS * (frame.stride + 2 * EDGE)
-    ring, rows = scratch(params, RING * widest), scratch(params, widest)
+    ring, rows = scratch(params, RING * widest), scratch(params, TOGETHER * widest)
     spans, weights = np.empty((frame.size // frame.stride, 2), np.int64), scratch(params, L)
     corners = np.empty((frame.size // (TILE_ROWS * L), 2), np.int64)
     moved, sums, total = scratch(params, FACTORS * SLOPES * L), scratch(params, PAIRS * L), np.empty(PAIRS)
@@ -143,24 +144,26 @@ def sum_windows(params, splat, channel, box, frame, size, footprints, planes, wo
     for y in range(y0 - 2 * REACH, y0):  # the rows above the splat
         clear_row(ring, y, vectors, pitch, L)
     unflushed, a = 0, footprints[0].splat_start[splat]
-    for ahead in range(y0, y1 + 2 * REACH + 1):  # the row that comes into the ring
-        clear_row(ring, ahead, vectors, pitch, L)
-        if ahead <= y1:
-            a = fill_row(params, splat, channel, ahead, box, frame, size[1], footprints, a, planes, work)
-        row = ahead - REACH  # of the windows' centres: all of their rows are there now
-        if row < 0 or row >= size[0]:
-            continue
-        # the columns that any window of this row can see of the splat
-        lo, hi = hull_of(spans, max(row - REACH, y0), min(row + REACH, y1))  # of the splat within these windows
+    for first in range(y0 - REACH, y1 + REACH + 1, TOGETHER):  # rows of windows' centres
+        # the rows that come into the ring
+        for ahead in range(first + REACH, first + REACH + TOGETHER):
+            clear_row(ring, ahead, vectors, pitch, L)
+            if y0 <= ahead <= y1:
+                a = fill_row(params, splat, channel, ahead, box, frame, size[1], footprints, a, planes, work)
+        # the columns that any window of these rows can see of the splat
+        last = min(first + TOGETHER - 1, y1 + REACH)
+        lo, hi = hull_of(spans, max(first - REACH, y0), min(last + REACH, y1))
         if hi < 0:
             continue
         lo, hi = lo - left, hi - left
         columns = (max(lo - REACH, 0) // L * L, min((hi + REACH) // L, vectors - 1) * L)
-        # down the columns, then along the row, then into the sums
-        blur_columns(work, row, lo // L * L, hi, columns, pitch, L)
-        add_windows(params, splat, row, left, columns, frame, planes, pitch, work)
-        unflushed += 1
-        if unflushed == FLUSH:
+        # down the columns, then along each row, then into the sums
+        blur_columns(work, first, lo // L * L, hi, columns, pitch, L)
+        for row in range(max(first, 0), min(last + 1, size[0])):
+            at = (row - first) * FIELDS * pitch + EDGE
+            add_windows(params, splat, row, left, columns, frame, planes, at, pitch, work)
+        unflushed += TOGETHER
+        if unflushed >= FLUSH:
             flush(sums, L, part, total)
             unflushed = 0
     flush(sums, L, part, total)
@@ -243,58 +246,51 @@ def dot5(x, taps):
 
 
 @formula
-def sums_around(array, at, step):
-    """F(x + t) + F(x - t) for t = 1 to 5."""
-    return (
-        load(array, at + step) + load(array, at - step),
-        load(array, at + 2 * step) + load(array, at - 2 * step),
-        load(array, at + 3 * step) + load(array, at - 3 * step),
-        load(array, at + 4 * step) + load(array, at - 4 * step),
-        load(array, at + 5 * step) + load(array, at - 5 * step),
-    )
+def both_ways(array, at):
+    """F(x + t) + F(x - t) and F(x + t) - F(x - t) for t = 1 to 5."""
+    p1, p2, p3, p4, p5, m1, m2, m3, m4, m5 = neighbours(array, at)
+    return (p1 + m1, p2 + m2, p3 + m3, p4 + m4, p5 + m5), (p1 - m1, p2 - m2, p3 - m3, p4 - m4, p5 - m5)
 
 
 @formula
-def differences_around(array, at):
-    """F(x + t) - F(x - t) for t = 1 to 5."""
-    return (
-        load(array, at + 1) - load(array, at - 1),
-        load(array, at + 2) - load(array, at - 2),
-        load(array, at + 3) - load(array, at - 3),
-        load(array, at + 4) - load(array, at - 4),
-        load(array, at + 5) - load(array, at - 5),
-    )
-
-
-@formula
-def sums_over_rows(ring, at, row, step):
-    """F(y + t) + F(y - t) for t = 1 to 5, from the ring."""
-    return (
-        load(ring, at + slot(row + 1) * step) + load(ring, at + slot(row - 1) * step),
-        load(ring, at + slot(row + 2) * step) + load(ring, at + slot(row - 2) * step),
-        load(ring, at + slot(row + 3) * step) + load(ring, at + slot(row - 3) * step),
-        load(ring, at + slot(row + 4) * step) + load(ring, at + slot(row - 4) * step),
-        load(ring, at + slot(row + 5) * step) + load(ring, at + slot(row - 5) * step),
-    )
+def blurred(F):
+    """The middle of eleven rows, blurred."""
+    sums = (F[6] + F[4], F[7] + F[3], F[8] + F[2], F[9] + F[1], F[10] + F[0])
+    return F[5] * MIDDLE + dot5(sums, TAPS)
 
 
 @formula
 def blur_columns(work, row, lo, hi, columns, pitch, L):
-    """Blur every field down the columns lo .. hi; 0 in the other columns that windows centred in `columns` reach."""
+    """Blur TOGETHER rows of every field, from this row on, down the columns lo .. hi: each row of the ring is read once.
+
+    0 in the other columns that windows centred in `columns` reach.
+    """
     ring, rows, _corners, _spans, _moved, _sums = work
     step, (first, last) = FIELDS * pitch, columns
     for at in range(EDGE, EDGE + step, pitch):
-        for x in range(first - max(L, 8), last + max(L, 8) + L, L):
-            if lo <= x <= hi:
-                middle = load(ring, at + x + slot(row) * step) * MIDDLE
-                store(rows, at + x, middle + dot5(sums_over_rows(ring, at + x, row, step), TAPS))
+        for x in range(at + first - max(L, 8), at + last + max(L, 8) + L, L):
+            if lo <= x - at <= hi:
+                F = (
+                    load(ring, x + slot(row - 5) * step), load(ring, x + slot(row - 4) * step),
+                    load(ring, x + slot(row - 3) * step), load(ring, x + slot(row - 2) * step),
+                    load(ring, x + slot(row - 1) * step), load(ring, x + slot(row) * step),
+                    load(ring, x + slot(row + 1) * step), load(ring, x + slot(row + 2) * step),
+                    load(ring, x + slot(row + 3) * step), load(ring, x + slot(row + 4) * step),
+                    load(ring, x + slot(row + 5) * step), load(ring, x + slot(row + 6) * step),
+                    load(ring, x + slot(row + 7) * step), load(ring, x + slot(row + 8) * step),
+                )  # fmt: skip
+                store(rows, x, blurred(F[0:11]))
+                store(rows, x + step, blurred(F[1:12]))
+                store(rows, x + 2 * step, blurred(F[2:13]))
+                store(rows, x + 3 * step, blurred(F[3:14]))
             else:
-                store(rows, at + x, 0.0)
+                for k in range(TOGETHER):
+                    store(rows, x + k * step, 0.0)
 
 
 @formula
-def add_windows(params, splat, row, left, columns, frame, planes, pitch, work):
-    """Add M . S'' M' of the windows centred in a row, in these columns, to the sums."""
+def add_windows(params, splat, row, left, columns, frame, planes, at, pitch, work):
+    """Add M . S'' M' of the windows centred in a row, in these columns, to the sums; at: where its blurred fields begin."""
     _image, _target, seconds, top = planes
     _ring, rows, _corners, _spans, moved, sums = work
     L = lanes(params)
@@ -302,7 +298,7 @@ def add_windows(params, splat, row, left, columns, frame, planes, pitch, work):
     for x in range(columns[0], columns[1] + L, L):
         u, _terms = alpha_terms(params, splat * PARAMS, left + x, row)
         for factor in range(FACTORS):
-            blur_row(rows, POWERS * factor * pitch + EDGE + x, pitch, u, along, moved, SLOPES * factor * L)
+            blur_row(rows, at + POWERS * factor * pitch + x, pitch, u, along, moved, SLOPES * factor * L)
         p = top + row * frame.stride + left + x
         second = (
             load(seconds, p), load(seconds, p + size), load(seconds, p + 2 * size),
@@ -316,11 +312,11 @@ def blur_row(rows, at, pitch, u, along, moved, to):
     """Blur along a row, for the vector at `at`: one component of M for each slope, to moved."""
     L = lanes(rows)
     # D f: B_0, B_1 and B_2 from the sums and differences at equal distances
-    F, s, d = load(rows, at), sums_around(rows, at, 1), differences_around(rows, at)
-    B0, B1, B2 = F * MIDDLE + dot5(s, TAPS), along * dot5(d, FIRST), along * along * dot5(s, SECOND)
+    s, d = both_ways(rows, at)
+    B0, B1, B2 = load(rows, at) * MIDDLE + dot5(s, TAPS), along * dot5(d, FIRST), along * along * dot5(s, SECOND)
     # D f v: the same without the second power of u
-    Fv, sv = load(rows, at + pitch), sums_around(rows, at + pitch, 1)
-    C0, C1 = Fv * MIDDLE + dot5(sv, TAPS), along * dot5(differences_around(rows, at + pitch), FIRST)
+    s, d = both_ways(rows, at + pitch)
+    C0, C1 = load(rows, at + pitch) * MIDDLE + dot5(s, TAPS), along * dot5(d, FIRST)
     uB = u * B0 + B1
     # slopes D, D u, D v, D u^2, D u v; then D v^2 and w, which have no u
     store(moved, to, B0)
@@ -330,7 +326,7 @@ def blur_row(rows, at, pitch, u, along, moved, to):
     store(moved, to + 4 * L, u * C0 + C1)
     for field in range(2, 4):
         at_field = at + field * pitch
-        store(moved, to + (3 + field) * L, load(rows, at_field) * MIDDLE + dot5(sums_around(rows, at_field, 1), TAPS))
+        store(moved, to + (3 + field) * L, load(rows, at_field) * MIDDLE + dot5(both_ways(rows, at_field)[0], TAPS))
 
 
 @formula
