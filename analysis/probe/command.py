@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from analysis.measures.per_attribute import PerAttributeOptions
 
 CHECK_FAILED = 1
+MANY_VIEWS, FEWER_POINTS = 10, 21
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
@@ -71,7 +72,7 @@ def _run(
     """The probe in this process.  ranks: of the processes that share the views, where there are several."""
     start = perf_counter()
     out = options.out or options.checkpoint.parent / ("probe-quick" if options.quick else "probe")
-    settings, families = probe_settings(options), _family_options(options)
+    families = _family_options(options)
     if ranks is not None and families is not None:
         raise InputError(
             "expected no --per-attribute, --split-control or --metric under torchrun, got one; run it in one process"
@@ -85,7 +86,7 @@ def _run(
         checkpoint, scene = subject.checkpoint, subject.scene
         checkpoint.training.move(device)
         objective = subject.objective(loss=LossSettings() if options.loss == "3dgs" else None)
-    guessed = guess(checkpoint.origin)
+    settings, guessed = probe_settings(options, len(checkpoint.scene.train)), guess(checkpoint.origin)
     say(*guessed, _introduction(scene, checkpoint, objective), console=console)
     say(
         _expected(objective, settings, (families.products if families else 0.0) + MEASURES * options.measures),
@@ -145,14 +146,16 @@ def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[No
 
 def asked(options: ProbeOptions, checkpoint: Checkpoint) -> Fingerprint:
     """What the numbers of a probe with these options are about.  checkpoint: thinned as they say."""
-    families = _family_options(options)
-    settings = asdict(probe_settings(options)) | ({} if families is None else {"per_attribute": asdict(families)})
-    return checkpoint.fingerprint(settings, options.seed, LossSettings() if options.loss == "3dgs" else None)
+    settings, families = probe_settings(options, len(checkpoint.scene.train)), _family_options(options)
+    numbers = asdict(settings) | ({} if families is None else {"per_attribute": asdict(families)})
+    return checkpoint.fingerprint(numbers, options.seed, LossSettings() if options.loss == "3dgs" else None)
 
 
-def probe_settings(options: ProbeOptions) -> ProbeSettings:
+def probe_settings(options: ProbeOptions, views: int) -> ProbeSettings:
+    """Settings of a probe of so many views: each point of the slice renders them all."""
     settings = ProbeSettings.quick() if options.quick else ProbeSettings()
-    changes: dict[str, Any] = {"slice_points": options.slice_points, "density_matvecs": options.density_products}
+    points = options.slice_points or (FEWER_POINTS if views >= MANY_VIEWS else None)
+    changes: dict[str, Any] = {"slice_points": points, "density_matvecs": options.density_products}
     if options.end_products is not None:
         changes["eigen"] = replace(settings.eigen, max_matvecs=options.end_products)
     changes = {name: value for name, value in changes.items() if value is not None}

@@ -34,7 +34,7 @@ class ProbeOptions:
     """At most, of the search for the extreme eigenvalues.  Default: 3000."""
     slice_points: int | None = None
     """Along each side of the slice, odd, 5 or more.
-    Default: 41, with --quick 21."""
+    Default: 41; 21 with --quick, or of 10 views or more."""
     per_attribute: bool = False
     """Also anisotropy of all attributes and of each, by four times as many products as the rest.
     Not under torchrun."""

@@ -74,7 +74,7 @@ def made_by(path: Path, name: str) -> RendererHessian:
 
 def _probed(H: RendererHessian, options: ProbeOptions, made: Provenance, stages: Stages) -> tuple[ProbeRecord, Arrays]:
     """The record and its arrays; says the work first."""
-    settings, (forth, back), size = probe_settings(options), H.passes(vectors=1), H.dim
+    settings, (forth, back), size = probe_settings(options, len(H.views)), H.passes(vectors=1), H.dim
     most = options.end_products or (60 if options.quick else 300)
     say(
         f"{len(H.views)} views, {size:,} parameters; H v takes {forth} renders and {back} backward passes, "

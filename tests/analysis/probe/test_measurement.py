@@ -1,6 +1,7 @@
 """The stages of a probe at a small scene."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,7 +10,9 @@ from analysis.console.stages import Stages
 from analysis.measures.per_attribute import PerAttributeOptions
 from analysis.measures.units import optimiser_units
 from analysis.probe import measurement
+from analysis.probe.command import probe_settings
 from analysis.probe.measurement import measure
+from analysis.probe.options import ProbeOptions
 from analysis.probe.plan import expected_seconds
 from analysis.probe.settings import ProbeSettings
 from landscape import EigenSettings, TraceSettings, extreme_eigenpairs
@@ -113,6 +116,12 @@ def test_a_quick_probe_is_expected_to_take_what_it_makes_alone():
     assert expected_seconds(quick, 2.0, PerAttributeOptions().products) - seconds[0] == pytest.approx(
         4.5 * 2 * 6 * 26 * 2.0
     )
+
+
+def test_a_point_of_the_slice_renders_all_views_so_many_views_have_fewer_points():
+    asked = [ProbeOptions(Path("x")), ProbeOptions(Path("x"), slice_points=31), ProbeOptions(Path("x"), quick=True)]
+    sides = [[probe_settings(options, views).slice_points for views in (9, 10)] for options in asked]
+    assert sides == [[41, 21], [31, 31], [21, 21]]
 
 
 def test_traces_that_samples_do_not_resolve_are_exact():
