@@ -17,6 +17,5 @@ def refused(words: str, call: Callable[..., object], *given: Any, error: Any = I
     return str(caught.value)
 
 
-misused = partial(
-    refused, error=ValueError
-)  # by a call that is a fault of the program: no sentence for whoever gave input
+# by a call that is a fault of the program: no sentence for whoever gave input
+misused = partial(refused, error=ValueError)

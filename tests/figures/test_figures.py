@@ -139,9 +139,8 @@ def test_titles_of_renders_along_an_end_stay_apart(tmp_path):
     colours = [each.get_edgecolor() for axes in figure.axes for each in axes.patches if isinstance(each, Ellipse)]
     assert len(colours) == 10 and len(set(colours)) == 5
     part = next(axes for axes in figure.axes if "15%" in str([text.get_text() for text in axes.texts]))
-    assert all(
-        text.get_window_extent().y1 < part.get_window_extent().y0 for text in part.texts
-    )  # they cover no outline
+    # they cover no outline
+    assert all(text.get_window_extent().y1 < part.get_window_extent().y0 for text in part.texts)
 
 
 def test_the_drawn_traces_are_the_recorded_ones(tmp_path):
@@ -243,16 +242,13 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     evaluated[::5, ::4] = True
     arrays["slice"]["evaluated"], arrays["slice"]["crossed"] = evaluated, evaluated & (np.arange(21) > 10)[:, None]
     data["slice"]["interpolation_error"] = 0.004
-    record = written(tmp_path / "probe", data, arrays)
-    figure = slice2d.draw(record)
-    dots = {
-        line.get_color(): len(np.asarray(line.get_xdata())) for line in figure.axes[0].lines if line.get_marker() == "."
-    }
+    figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
+    dotted = [line for line in figure.axes[0].lines if line.get_marker() == "."]
+    dots = {line.get_color(): len(np.asarray(line.get_xdata())) for line in dotted}
     assert dots == {slice2d.FAINT["color"]: 5 * 5}
     said = " ".join(text for text, _ in words(figure, laid_out(figure)))
-    assert (
-        "plane: 7% rendered,\nelse interpolated (error <0.40%)" in said and "order changed: 10\nof 25 renders" in said
-    )
+    for part in ("plane: 7% rendered,\nelse interpolated (error <0.40%)", "order changed: 10\nof 25 renders"):
+        assert part in said
     assert _blue(figure) == [2, 0]
 
 
@@ -303,20 +299,17 @@ def test_ranges_that_are_alike_have_the_same_ticks(tmp_path, stretch, same):
     assert (first == second) == same
 
 
+FAR = "what its curvature says, at 0.30 to 3.0 curvature units"
+
+
 @pytest.mark.parametrize(
     ("ratio", "said"),
     [
         (lambda s: 1.1, "curves as its curvature says"),
-        (lambda s: 0.14, "curves up 0.14 times what its curvature says, at 0.30 to 3.0 curvature units"),
-        (
-            lambda s: 2.15 - 1.03 * s,
-            "curves up 1.1 to 2.0 times what its curvature says, at 0.30 to 3.0 curvature units",
-        ),
+        (lambda s: 0.14, f"curves up 0.14 times {FAR}"),
+        (lambda s: 2.15 - 1.03 * s, f"curves up 1.1 to 2.0 times {FAR}"),
         (lambda s: 1.1 - s, "curves as its curvature says to 0.90 curvature units, then 0.10 to 0.70 times as much"),
-        (
-            lambda s: 10 * (s - 0.5) ** 2 - 0.2,
-            "curves −0.20 to 2.3 times what its curvature says, at 0.30 to 3.0 curvature units",
-        ),
+        (lambda s: 10 * (s - 0.5) ** 2 - 0.2, f"curves −0.20 to 2.3 times {FAR}"),
         (lambda s: 1.3 - 1.5 * s, "curves as its curvature says to 0.90 curvature units, then falls on one side"),
         (lambda s: -0.2, "falls on one side, against its curvature"),
         (lambda s: -2.0, "falls on both sides, against its curvature"),
@@ -392,8 +385,7 @@ def test_the_command_draws_the_folder_named_on_its_standard_input(tmp_path):
 def test_the_end_of_a_process_that_draws_is_said(tmp_path, monkeypatch):
     folder = written(tmp_path / "probe", *synthetic()).folder
     monkeypatch.setitem(make_all.FIGURES, "traces", lambda record: os.kill(os.getpid(), signal.SIGKILL))
-    with pytest.raises(TooLittleMemory, match="a process that draws was ended"):
-        make_all.draw_probe(folder, processes=2)
+    refused("a process that draws was ended", make_all.draw_probe, folder, processes=2, error=TooLittleMemory)
 
 
 def test_a_surface_marks_its_renders_and_has_true_proportions_or_says_that_it_has_not(tmp_path):

@@ -53,11 +53,24 @@ def runs(tmp_path) -> list[Path]:
 
 
 @pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
-def test_everything_stays_inside_the_page(runs, module):
+def test_everything_stays_inside_the_page_steps_have_their_unit_and_ticks_overlap_no_words(runs, module):
     figure = module.draw(runs)
-    drawn = figure.get_tightbbox(laid_out(figure))
+    renderer = laid_out(figure)
+    drawn = figure.get_tightbbox(renderer)
     assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
     assert drawn.x1 <= figure.get_figwidth() + POINT and drawn.y1 <= figure.get_figheight() + POINT
+    steps = [axes.get_xlabel() for axes in figure.axes if not hasattr(axes, "get_zlim")]
+    steps = [label for label in steps if label.startswith("step along")]
+    assert steps and all("units of the parameters" in label for label in steps)
+    for axes in figure.axes:
+        names = [axes.xaxis.label, axes.yaxis.label]
+        ticks = axes.get_xticklabels() + (axes.get_yticklabels() if hasattr(axes, "get_zlim") else [])
+        low, high = axes.get_xlim()
+        shown = [t for t in ticks if t.get_text() and (hasattr(axes, "get_zlim") or low <= t.get_position()[0] <= high)]
+        boxes = [text.get_window_extent(renderer).shrunk(0.9, 0.7) for text in shown]
+        assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i]), [t.get_text() for t in shown]
+        if not hasattr(axes, "get_zlim"):
+            assert not any(name.get_window_extent(renderer).overlaps(box) for name in names for box in boxes)
 
 
 def test_stored_records_need_no_checkpoint(runs):
@@ -114,29 +127,6 @@ def test_a_start_that_slopes_down_is_not_cut_off_at_the_ends_own_limits(runs):
     assert along_e1.get_ylim()[0] <= np.nanmin(start) < 0
 
 
-@pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
-def test_steps_have_their_unit(runs, module):
-    flat = [axes for axes in module.draw(runs).axes if axes.get_xlabel().startswith("step along")]
-    assert (
-        all("units of the parameters" in axes.get_xlabel() for axes in flat if not hasattr(axes, "get_zlim")) and flat
-    )
-
-
-@pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
-def test_ticks_of_steps_overlap_neither_each_other_nor_axes_names(runs, module):
-    figure = module.draw(runs)
-    renderer = laid_out(figure)
-    for axes in figure.axes:
-        names = [axes.xaxis.label, axes.yaxis.label]
-        ticks = axes.get_xticklabels() + (axes.get_yticklabels() if hasattr(axes, "get_zlim") else [])
-        low, high = axes.get_xlim()
-        shown = [t for t in ticks if t.get_text() and (hasattr(axes, "get_zlim") or low <= t.get_position()[0] <= high)]
-        boxes = [text.get_window_extent(renderer).shrunk(0.9, 0.7) for text in shown]
-        assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i]), [t.get_text() for t in shown]
-        if not hasattr(axes, "get_zlim"):
-            assert not any(name.get_window_extent(renderer).overlaps(box) for name in names for box in boxes)
-
-
 def test_the_colours_of_the_surfaces_have_bars_and_open_dots_a_word(runs):
     figure = fig7.draw(runs)
     bars = [axes for axes in figure.axes if axes.get_label() == "<colorbar>"]
@@ -173,7 +163,7 @@ def test_for_a_paper_titles_are_letters_and_the_caption_lies_beside_it(runs, tmp
             "(d) stablegs not scored.",
             "stablegs is the flatter one",
             "where the paper has StableGS flatter. One training",
-        )  # as they are read
+        )
         assert [words for words in said if words not in caption] == []
 
 

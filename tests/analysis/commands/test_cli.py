@@ -376,18 +376,8 @@ def test_the_held_out_views_of_a_scene_without_any_are_not_scored(tmp_path, caps
 
 def test_random_backgrounds_and_other_losses_train(original, tmp_path):
     out = tmp_path / "run"
-    more = [
-        "--background",
-        "random",
-        "--pixel-loss",
-        "charbonnier",
-        "--no-densify",
-        "--sh-degree",
-        "0",
-        "--views",
-        "all",
-    ]
-    assert main(arguments(original, out, *more)) == 0
+    more = "--background random --pixel-loss charbonnier --no-densify --sh-degree 0 --views all"
+    assert main(arguments(original, out, *more.split())) == 0
     config = load_checkpoint(out / "checkpoint.pt").training.config
     assert config.random_background and config.loss.pixel == "charbonnier" and not config.densify.enabled
     assert config.sh_degree == 0

@@ -29,10 +29,8 @@ MADE = synthetic_scene(SyntheticSettings(gaussians=60, views=5, width=24, height
 @pytest.fixture
 def folder(tmp_path) -> Path:
     write_transforms_scene(MADE.scene, tmp_path / "scene")
-    extra = {"weight": np.arange(len(MADE.truth)) / 7}
-    (tmp_path / "in.ply").write_bytes(
-        written.ply({**written.columns(MADE.truth), **extra}, ("trained by splat-landscape",))
-    )
+    columns = {**written.columns(MADE.truth), "weight": np.arange(len(MADE.truth)) / 7}
+    (tmp_path / "in.ply").write_bytes(written.ply(columns, ("trained by splat-landscape",)))
     return tmp_path
 
 
@@ -84,7 +82,11 @@ def test_a_training_starts_from_another_tools_gaussians_with_its_renderer(folder
         str(folder / "scene"),
         "--from",
         str(source),
-        *["--no-densify", "--iterations", "2", "--views", "2"],
+        "--no-densify",
+        "--iterations",
+        "2",
+        "--views",
+        "2",
     ]
     assert main([*common, "--trained-by", "gsplat-raw", "--out", str(out)]) == 0
     training = load_checkpoint(out / "checkpoint.pt").training
@@ -155,9 +157,8 @@ def test_what_a_file_says_of_its_renderer_goes_with_it(folder, capsys):
     (folder / "model/cfg_args").write_text("Namespace(kernel_size=0.3, resolution=-1)")
     assert convert(model / "point_cloud.ply", folder / "m.ply") == 0
     assert b"px wide" not in (folder / "m.ply").read_bytes()  # -1 is graphdeco's word for its default
-    assert "no --trained-by renders as it was (antialiasing mip-splatting, blur 0.3" in " ".join(
-        capsys.readouterr().err.split()
-    )
+    said = " ".join(capsys.readouterr().err.split())
+    assert "no --trained-by renders as it was (antialiasing mip-splatting, blur 0.3" in said
 
 
 @pytest.mark.parametrize("to", ["graphdeco", "gsplat"])

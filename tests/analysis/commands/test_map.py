@@ -55,9 +55,8 @@ def test_the_files_hold_every_field_of_every_gaussian(folder):
     written = read_splats(folder / "map" / "fields.ply")
     assert torch.equal(written.gaussians.flat, read_splats(folder / "in.ply").gaussians.flat)
     assert [*written.extra] == [*FIELDS]
-    objective = SceneObjective(
-        MADE.truth, load_scene(folder / "scene").load([f"images/view_00{i}.png" for i in (1, 2, 3)])
-    )
+    views = load_scene(folder / "scene").load([f"images/view_00{i}.png" for i in (1, 2, 3)])
+    objective = SceneObjective(MADE.truth, views)
     fields, _ = scene_fields(objective)
     for name, column in fields.items():
         found = written.extra[name]
@@ -91,10 +90,8 @@ def test_a_run_folder_is_mapped_like_the_file_it_was_made_of(folder, capsys):
     words = [str(folder / "in.ply"), run, "--scene", str(folder / "scene"), "--views", "all"]
     assert main(["convert", *words]) == 0 and main(["map", str(folder / "run"), "--draw", "0"]) == 0
     said = capsys.readouterr().out  # every file by its name or its pattern, once
-    assert (
-        "pictures: fragility-NNN.png, view-NNN.png; splats" in said
-        and "of each Gaussian by itself, largest curv" in said
-    )
+    assert "pictures: fragility-NNN.png, view-NNN.png; splats" in said
+    assert "of each Gaussian by itself, largest curv" in said
     found, before = (read_map(path / "map") for path in (folder / "run", folder))
     assert (found.fragility, found.shades, found.sentences) == (before.fragility, before.shades, before.sentences)
 
@@ -147,9 +144,8 @@ def test_the_distance_to_a_swap_is_drawn_from_far_to_near_and_bright():
     bar = show_scaled(axes, np.zeros((4, 6), np.uint8), shade, "", "")
     assert bar.ax.get_xlim() == pytest.approx((10.0, 0.1))
     near, far = (np.array(bar.cmap(bar.norm(value))[:3]) for value in (0.1, 10.0))
-    assert far.sum() < near.sum() and near == pytest.approx(
-        np.asarray(axes.images[0].get_array())[0, 0] / 255, abs=1 / 255
-    )
+    first = np.asarray(axes.images[0].get_array())[0, 0] / 255
+    assert far.sum() < near.sum() and near == pytest.approx(first, abs=1 / 255)
     assert "to left" in shade.legend and shade.legend.index("≥ 10<") < shade.legend.index("≤ 0.10<")  # others beyond
     assert not set("≥≤") & set(structs.replace(shade, name="one_view").legend)
 

@@ -51,11 +51,8 @@ def test_a_needle_has_the_curvature_in_rotation():
 
 
 def test_a_blocker_of_one_view_is_alone_in_it():
-    near = {
-        "means": [1.15, 0.0, 1.2],
-        "log_scales": [-2.0] * 3,
-        "opacity_logits": 1.0,
-    }  # before the second camera alone
+    # before the second camera alone
+    near = {"means": [1.15, 0.0, 1.2], "log_scales": [-2.0] * 3, "opacity_logits": 1.0}
     objective = scene_of([{}, near, {"means": [-0.5, 0.2, 4.0]}], TWO)
     found, (values, _) = measured(objective), scene_fields(objective)
     curvature = values["trace_opacity_logits"].abs()

@@ -6,6 +6,7 @@ import re
 from contextlib import nullcontext
 from dataclasses import astuple, replace
 from html.parser import HTMLParser
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -151,9 +152,8 @@ def test_every_family_is_that_of_the_dense_block_in_the_metrics_units(split, obj
             assert low - 1e-9 * size <= float(spectrum[-1]) <= high + 1e-9 * size, (row.block, scene)
             least, residual = float(ends.smallest.values[0]), float(ends.smallest.residuals[0])
             assert float((spectrum - least).abs().min()) <= residual + 1e-9 * size
-            if not ends.smallest.reason.endswith(
-                "budget"
-            ):  # of Gauss-Newton's, next to nothing, 40 products may see no end
+            # of Gauss-Newton's, next to nothing, 40 products may see no end
+            if not ends.smallest.reason.endswith("budget"):
                 assert least - residual <= float(spectrum[0]) + 1e-9 * size, (row.block, scene)
                 resolved += 1
             for name, value in indices(spectrum).items():
@@ -164,9 +164,7 @@ def test_every_family_is_that_of_the_dense_block_in_the_metrics_units(split, obj
 
 
 def test_the_splits_effect_brackets_the_quotient_of_dense_indices(split, objective, checkpoint):
-    assert {(e.operator, e.block) for e in split.effects} == {
-        (o, b) for o in ("hessian", "gauss-newton") for b in BLOCKS
-    }
+    assert {(e.operator, e.block) for e in split.effects} == {*product(("hessian", "gauss-newton"), BLOCKS)}
     held = []
     for operator in ("hessian", "gauss-newton"):
         before, after = (spectra(of, checkpoint, operator) for of in (objective, of_split(objective, checkpoint)))
@@ -175,13 +173,9 @@ def test_the_splits_effect_brackets_the_quotient_of_dense_indices(split, objecti
         ):
             true = indices(after[effect.block])[effect.index] / indices(before[effect.block])[effect.index]
             held.append(effect.low <= true <= effect.high)
-            values = [getattr(row.family.indices, effect.index).value for row in split.rows if matches(row, effect)]
-            assert effect.value == values[1] / values[0]
+            both = [row.family.indices for row in split.rows if (row.operator, row.block) == (operator, effect.block)]
+            assert effect.value == getattr(both[1], effect.index).value / getattr(both[0], effect.index).value
     assert held.count(False) <= most_misses(len(held), 0.1), held
-
-
-def matches(row, effect) -> bool:
-    return (row.operator, row.block) == (effect.operator, effect.block)
 
 
 def test_a_quotient_is_undetermined_where_a_bracket_has_0_or_no_end():
@@ -322,12 +316,8 @@ def test_the_ends_that_were_looked_for_lead_to_those_of_the_whole(objective, che
     ends = extreme_eigenpairs(SceneHessian(objective), torch.Generator().manual_seed(1), EigenSettings(2, 1))
     found(objective, checkpoint, metric=metric, split_control=True, ends=ends)
     known = torch.stack([ends.largest.vectors[:, 0], ends.smallest.vectors[:, 0]], dim=1)
-    begins = [whole for whole, start in starts if same(start, known)]
+    begins = [whole for whole, start in starts if start is not None and torch.equal(start, known)]
     assert begins == ([True] if metric == "parameters" else [])  # those of the trained scene's Hessian alone
-
-
-def same(a: torch.Tensor | None, b: torch.Tensor) -> bool:
-    return a is not None and a.shape == b.shape and torch.equal(a, b)
 
 
 def test_memory_bounds_the_vectors_that_are_kept(objective, checkpoint):

@@ -81,43 +81,19 @@ def test_a_disc_from_its_edge_is_a_plate_and_a_rod_is_a_needle(shown):
         assert f": {kind}, 21 : 1 in the picture, in the " in sentence(end, [moved], 1.0, view, 2)
 
 
-UNIT, MEAN = "× the optimiser's step", "the mean of back and forth (by its curvature alone:"
+UNIT, AGAINST = "× the optimiser's step", [-1.9, -1.4, -0.2]
+ALONG, MEAN = f"{UNIT} along e", "the mean of back and forth (by its curvature alone:"
 
 
 @pytest.mark.parametrize(
     ("curvature", "ratios", "confirmed", "said"),
     [
-        (
-            4.0,
-            [0.9, 1.0, 1.1],
-            True,
-            f"A step of 2 {UNIT} along e raises the loss by 4.4%, {MEAN} 4.0%); renders agree ",
-        ),
-        (
-            4.0,
-            [1.0, 0.9, 3.0],
-            True,
-            f"A step of 1 {UNIT} along e raises the loss by 0.90%, {MEAN} 1.0%); renders agree ",
-        ),
-        (-4.0, [1.0, 1.1, -1.0], True, f"A step of 1 {UNIT} along e lowers the loss by 1.1%, "),
-        (
-            -4.0,
-            [0.6, 0.5, None],
-            False,
-            f"A step of 1 {UNIT} along e lowers the loss by 0.50%, {MEAN} 1.0%); not confirmed",
-        ),
-        (
-            -4.0,
-            [-1.9, -1.4, -0.2],
-            False,
-            "The negative curvature along e is not confirmed by renders, by which it is 5.6 ",
-        ),
-        (
-            4.0,
-            [-1.9, -1.4, -0.2],
-            None,
-            "The curvature along e is not resolved: round-off hides it in renders at up to ",
-        ),
+        (4.0, [0.9, 1.0, 1.1], True, f"A step of 2 {ALONG} raises the loss by 4.4%, {MEAN} 4.0%); renders agree "),
+        (4.0, [1.0, 0.9, 3.0], True, f"A step of 1 {ALONG} raises the loss by 0.90%, {MEAN} 1.0%); renders agree "),
+        (-4.0, [1.0, 1.1, -1.0], True, f"A step of 1 {ALONG} lowers the loss by 1.1%, "),
+        (-4.0, [0.6, 0.5, None], False, f"A step of 1 {ALONG} lowers the loss by 0.50%, {MEAN} 1.0%); not confirmed"),
+        (-4.0, AGAINST, False, "The negative curvature along e is not confirmed by renders, by which it is 5.6 "),
+        (4.0, AGAINST, None, "The curvature along e is not resolved: round-off hides it in renders at up to "),
     ],
 )
 def test_only_what_renders_bear_out_is_said_of_a_curvature(curvature, ratios, confirmed, said):

@@ -81,15 +81,21 @@ CHANGES: dict[str, tuple[Callable[[Path], Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("change", CHANGES)
-def test_what_changed_since_the_training_is_said_before_anything_is_measured(there, monkeypatch, capsys, change):
-    asked: list[str] = []
+@pytest.fixture
+def asked(monkeypatch) -> list[str]:
+    """What stages would be kept under, in place of measuring."""
+    found = []
 
     def measure(*given, **_):
-        asked.append(given[6])
+        found.append(given[6])
         raise InputError("measured")
 
     monkeypatch.setattr("analysis.probe.command.measure", measure)
+    return found
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_changed_since_the_training_is_said_before_anything_is_measured(there, asked, capsys, change):
     words = ["probe", str(there / "checkpoint.pt"), *QUICK]
     assert main(words) == 2 and "measured" in capsys.readouterr().err
     CHANGES[change][0](there)
@@ -102,14 +108,7 @@ def test_what_changed_since_the_training_is_said_before_anything_is_measured(the
     assert len(asked) == 2 and (asked[0] == asked[1]) == same
 
 
-def test_stages_are_kept_for_the_same_data_question_state_and_formulas_alone(there, monkeypatch):
-    asked: list[str] = []
-
-    def measure(*given, **_):
-        asked.append(given[6])
-        raise InputError("measured")
-
-    monkeypatch.setattr("analysis.probe.command.measure", measure)
+def test_stages_are_kept_for_the_same_data_question_state_and_formulas_alone(there, asked, monkeypatch):
     words, path = ["probe", str(there / "checkpoint.pt"), *QUICK], there / "checkpoint.pt"
     for more in ([], ["--strict"], ["--seed", "1"], ["--loss", "3dgs", "--max-views", "2"], ["--end-products", "50"]):
         assert main([*words, *more]) == 2

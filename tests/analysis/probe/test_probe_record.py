@@ -131,12 +131,8 @@ def test_the_summary_says_of_both_ends_what_renders_say_and_who_carries_them(rec
         mass = int(masses(vector, dense[0].active).argmax())
         assert end.carrier.gaussian == int(dense[0].mask.nonzero()[mass, 0])
         assert " of " in end.carrier.shape
-        agree = {
-            True: "renders agree within a factor of 2 at ",
-            False: "not confirmed by renders",
-            None: "not resolved",
-        }
-        assert agree[end.renders.confirmed] in lines[name] and "one training" in lines[name]
+        told = {True: "renders agree within a factor of 2 at ", False: "not confirmed by renders", None: "not resolved"}
+        assert told[end.renders.confirmed] in lines[name] and "one training" in lines[name]
 
 
 def skewed():
@@ -157,9 +153,8 @@ def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_pa
     assert main([*quick, str(tmp_path / "strict"), "--strict"]) == 1
     for name in ("lenient", "strict"):
         checks = read_record(tmp_path / name).data.checks
-        assert (
-            checks["symmetry"].passed is False and checks["finite_difference"].passed is True
-        )  # that is of single views
+        assert checks["symmetry"].passed is False
+        assert checks["finite_difference"].passed is True  # that is of single views
     said = " ".join(capsys.readouterr().out.split())
     assert "The check of symmetry failed" in said and "not symmetry (" in said and "steepest" not in said
 

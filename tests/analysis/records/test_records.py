@@ -17,10 +17,10 @@ from analysis.records.json_files import plain
 from analysis.records.records import ProbeRecord, SliceRecord, read_record, record_folder, write_data
 from analysis.records.run_files import read_trajectory
 from analysis.records.tables import family_table, number_rows
-from landscape.errors import InputError
 from tests import recorded
 from tests.figures.test_trajectory_figure import rows
 from tests.recorded import probe_of, synthetic
+from tests.refusals import refused
 
 
 def written(folder, data=None, arrays=None):
@@ -165,29 +165,25 @@ def test_a_changed_array_is_refused_by_file_and_name(tmp_path, array, words):
     arrays |= {"loss": array}
     known: dict[str, Any] = {name: values for name, values in arrays.items() if values is not None}
     np.savez(folder / "slice.npz", **known)
-    with pytest.raises(ValueError, match=rf"slice\.npz, got {words}.*; probe again"):
-        read_record(folder)
+    refused(rf"slice\.npz, got {words}.*; probe again", read_record, folder)
 
 
 def test_residuals_below_0_are_refused(tmp_path):
     folder, arrays = written(tmp_path / "probe"), synthetic()[1]["spectrum"]
     known: dict[str, Any] = arrays | {"residuals": -1.0 - arrays["residuals"]}
     np.savez(folder / "spectrum.npz", **known)
-    with pytest.raises(InputError, match=r"spectrum\.npz, got residuals below 0"):
-        read_record(folder)
+    refused(r"spectrum\.npz, got residuals below 0", read_record, folder)
 
 
 def test_steps_that_do_not_increase_are_refused(tmp_path):
     data, arrays = synthetic()
     arrays["slice"]["x"][3] = math.nan
-    with pytest.raises(ValueError, match="steps x that do not increase"):
-        written(tmp_path / "probe", data, arrays)
+    refused("steps x that do not increase", written, tmp_path / "probe", data, arrays)
 
 
 def test_arrays_of_objects_are_refused(tmp_path):
     data, _ = synthetic()
-    with pytest.raises(ValueError, match=r"slice\.x"):
-        written(tmp_path / "probe", data, {"slice": {"x": np.array([None, 1.0])}})
+    refused(r"slice\.x", written, tmp_path / "probe", data, {"slice": {"x": np.array([None, 1.0])}})
 
 
 def test_a_failing_block_leaves_the_old_record_and_no_trace(tmp_path):
@@ -250,8 +246,7 @@ def test_a_process_killed_while_it_writes_leaves_the_old_record_whole(tmp_path, 
 def test_a_replacement_interrupted_between_its_two_renames_is_mended(tmp_path):
     folder = written(tmp_path / "probe")
     folder.rename(tmp_path / ".probe.previous")
-    with pytest.raises(FileNotFoundError, match=r"interrupted; rename .*\.probe\.previous"):
-        read_record(folder)
+    refused(r"interrupted; rename .*\.probe\.previous", read_record, folder, error=FileNotFoundError)
     with pytest.raises(RuntimeError), record_folder(folder):
         raise RuntimeError
     assert read_record(folder).data.provenance.seed == 0
@@ -260,25 +255,19 @@ def test_a_replacement_interrupted_between_its_two_renames_is_mended(tmp_path):
 
 def test_a_folder_of_something_else_is_never_replaced(tmp_path):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(ValueError, match=r"without probe\.json"):
-        written(tmp_path)
-    with pytest.raises(ValueError, match="got the file"):
-        written(tmp_path / "thesis.tex")
+    refused(r"without probe\.json", written, tmp_path)
+    refused("got the file", written, tmp_path / "thesis.tex")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 def test_what_is_missing_is_said_with_what_to_do(tmp_path):
-    with pytest.raises(FileNotFoundError, match="does not exist; run `landscape probe"):
-        read_record(tmp_path / "nowhere")
-    with pytest.raises(FileNotFoundError, match="which has none"):
-        read_record(tmp_path)
+    refused("does not exist; run `landscape probe", read_record, tmp_path / "nowhere", error=FileNotFoundError)
+    refused("which has none", read_record, tmp_path, error=FileNotFoundError)
     written(tmp_path / "probe")
-    with pytest.raises(FileNotFoundError, match=r"which is a run; name .*probe"):
-        read_record(tmp_path)
+    refused(r"which is a run; name .*probe", read_record, tmp_path, error=FileNotFoundError)
     assert read_record(tmp_path / "probe" / "probe.json").data.counts.views == 3
     (tmp_path / "probe" / "slice.npz").unlink()
-    with pytest.raises(FileNotFoundError, match=r"slice\.npz.*probe again"):
-        read_record(tmp_path / "probe")
+    refused(r"slice\.npz.*probe again", read_record, tmp_path / "probe", error=FileNotFoundError)
 
 
 @pytest.mark.parametrize("name", ["probe.json", "slice.npz", "traces.npz"])
@@ -287,22 +276,19 @@ def test_a_truncated_file_is_named(tmp_path, name, share):
     path = written(tmp_path / "probe") / name
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ValueError, match=rf"{name}.*probe again"):
-        read_record(path.parent)
+    refused(rf"{name}.*probe again", read_record, path.parent)
 
 
 def test_an_array_of_another_shape_than_recorded_is_named(tmp_path):
     folder = written(tmp_path / "probe")
     np.savez(folder / "traces.npz", means=np.zeros(2))
-    with pytest.raises(ValueError, match=r"means of shape \[2\] instead of \[16\]"):
-        read_record(folder)
+    refused(r"means of shape \[2\] instead of \[16\]", read_record, folder)
 
 
 @pytest.mark.parametrize("foreign", ["[]", "{}", '{"format": 3}', '{"format": {"name": "other", "version": 1}}', "3"])
 def test_json_of_something_else_is_refused(tmp_path, foreign):
     (tmp_path / "probe.json").write_text(foreign)
-    with pytest.raises(ValueError, match="expected a record of `landscape probe`"):
-        read_record(tmp_path)
+    refused("expected a record of `landscape probe`", read_record, tmp_path)
 
 
 def test_a_newer_format_is_refused_with_what_to_do(tmp_path):
@@ -310,8 +296,7 @@ def test_a_newer_format_is_refused_with_what_to_do(tmp_path):
     raw = json.loads((folder / "probe.json").read_text(encoding="utf-8"))
     raw["format"]["version"] = ProbeRecord.FORMAT.version + 1
     (folder / "probe.json").write_text(json.dumps(raw))
-    with pytest.raises(ValueError, match=r"expected a record of `landscape probe` in .*; probe again"):
-        read_record(folder)
+    refused(r"expected a record of `landscape probe` in .*; probe again", read_record, folder)
 
 
 def test_records_reports_and_figures_need_no_torch():
@@ -396,5 +381,4 @@ def test_damaged_trajectories_are_refused_by_file_and_column(tmp_path):
         (lambda t: t.head(0)[[]], "No columns"),
     ):
         change(rows()).to_csv(path, index=False)
-        with pytest.raises(ValueError, match=words):
-            read_trajectory(path)
+        refused(words, read_trajectory, path)

@@ -30,6 +30,7 @@ from tests.figures.test_trajectory_figure import rows
 from tests.recorded import depth_section, long_numbers, own, synthetic, written
 
 ITERATIONS = 4
+KEYS = ["value", "low", "high"]
 SETTINGS = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
 FACTOR = {"value": 2.5, "low": 2.0, "high": 3.1, "note": ""}
 
@@ -43,18 +44,12 @@ def record(folder: Path, scale: float, **changes) -> None:
     data["split_control"] = {"gaussians": 20182, "rms": 0.01 * scale, "largest": 0.1, "psnr": 40.0 / scale}
     data["split_control"]["effects"] = effects
     end = {"value": 4.0, "residual": 0.1, "reason": "tolerance"}
-    about = {
-        "operator": "hessian",
-        "block": "means",
-        "metric": "parameters",
-        "unit": "units of the parameters",
-        "split": False,
-    }
+    about = {"operator": "hessian", "block": "means", "metric": "parameters", "unit": "units of the parameters"}
     index = {"value": 7.0 * scale, "low": 6.0 * scale, "high": 9.0 * scale, "note": ""}
     names = ("eigenvalue_ratio", "negative_ratio", "top_mass", "participation_ratio")
     family = {"gaussians": 10091, "dim": 30273, "rank": 30000, "lambda_max": end, "lambda_min": end}
     share = {name: value / 10 if name != "note" else value for name, value in index.items()}
-    family |= {"indices": dict.fromkeys(names, index) | {"top_mass": share}}
+    family |= {"indices": dict.fromkeys(names, index) | {"top_mass": share}, "split": False}
     data["per_attribute"] = [about | family, about | family | {"split": True, "gaussians": 20000}]
     written(folder, data, arrays)
 
@@ -82,6 +77,20 @@ def runs(trained, tmp_path) -> list[str]:
 @pytest.fixture
 def no_pictures(monkeypatch):
     monkeypatch.setattr("analysis.runs.compare.draw", lambda module, target: [])
+
+
+@pytest.fixture
+def probed(monkeypatch) -> list[tuple]:
+    """Options and command of every probe that is asked for, each of which leaves a record."""
+    asked = []
+
+    def probe(options, command) -> int:
+        asked.append((options, command))
+        record(options.checkpoint.parent / "probe", 1.0)
+        return 0
+
+    monkeypatch.setattr("analysis.runs.compared.run_probe", probe)
+    return asked
 
 
 def changed(run: str, **config) -> None:
@@ -118,7 +127,7 @@ def test_depth_over_lateral_is_compared_where_a_probe_has_it(runs, tmp_path, no_
         assert value in lines[f"depth / lateral {name}"] and lines[f"depth / lateral {name}"].rstrip().endswith("–")
     table = pd.read_csv(tmp_path / "with/compare.csv").set_index(["section", "quantity", "run"])
     rise = table.loc[("depth over lateral", "rise at 0.1 px", "plain/0")]
-    assert [float(rise[key]) for key in ("value", "low", "high")] == pytest.approx([0.28, 0.24, 0.32])
+    assert [float(rise[key]) for key in KEYS] == pytest.approx([0.28, 0.24, 0.32])
     assert "Depth over lateral" in (tmp_path / "with/compare.html").read_text()
 
 
@@ -129,21 +138,17 @@ def test_the_file_holds_the_numbers_of_the_records_and_metrics(trained, tmp_path
     for label, scale in (("plain/0", 1.0), ("sam/0", 0.5)):
         data, _ = synthetic(scale)
         metrics = json.loads((trained / label / "metrics.json").read_text())
-        trace, top = data["traces"]["quats"], data["eigenvalues"]["max"]
+        trace, top, ratio = data["traces"]["quats"], data["eigenvalues"]["max"], data["anisotropy"]["negative_ratio"]
         expected = {
-            ("trace", "rotation"): [trace[key] for key in ("value", "low", "high")],
+            ("trace", "rotation"): [trace[key] for key in KEYS],
             ("spectrum", "largest eigenvalue"): [top["value"] + sign * top["residual"] for sign in (0, -1, 1)],
-            ("anisotropy", "negative ratio"): [
-                data["anisotropy"]["negative_ratio"][key] for key in ("value", "low", "high")
-            ],
+            ("anisotropy", "negative ratio"): [ratio[key] for key in KEYS],
             ("anisotropy", "negative ratio, split control"): [2.5, 2.0, 3.1],
             ("per_attribute", "Hessian, position: negative ratio"): [7 * scale, 6 * scale, 9 * scale],
             ("per_attribute", "Hessian, position: negative ratio, split control"): [2.5, 2.0, 3.1],
         }
         for key, numbers in expected.items():
-            assert table.loc[(*key, label)][["value", "low", "high"]].astype(float).tolist() == pytest.approx(
-                numbers
-            ), key
+            assert table.loc[(*key, label)][KEYS].astype(float).tolist() == pytest.approx(numbers), key
         assert float(table.loc[("held-out views", "PSNR (dB)", label)]["value"]) == metrics["test"]["psnr"]
         assert float(table.loc[("run", "seconds of training", label)]["value"]) == metrics["seconds"]["wall"]
 
@@ -151,9 +156,8 @@ def test_the_file_holds_the_numbers_of_the_records_and_metrics(trained, tmp_path
 def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(trained, tmp_path, capsys, no_pictures):
     assert main(["compare", str(trained / "plain/0"), str(trained / "sam/0"), "--out", str(tmp_path)]) == 0
     said, page = capsys.readouterr().out, (tmp_path / "compare.html").read_text()
-    lines = [
-        line for line in said.splitlines() if not any(name in line for name in SCORES.values())
-    ]  # of their own places
+    # scores have their own places
+    lines = [line for line in said.splitlines() if not any(name in line for name in SCORES.values())]
     assert len(lines) > 20 and long_numbers("\n".join(lines)) == []
     assert "http" not in page.replace("http-equiv", "") and "<script" not in page
     assert "which hardly changes the image" in page
@@ -194,12 +198,8 @@ def test_seeds_are_compared_by_mean_and_spread(runs, capsys, no_pictures, tmp_pa
     trace = synthetic(1.0)[0]["traces"]["means"]["value"]
     cell = measured(1.05 * trace, 0.1 * trace / 2**0.5)
     assert cell in said and cell in page and "The pictures show the first run of each group" in said
-    spread, of_one, number = (
-        "stands the standard deviation over them",
-        "Behind ± stands one standard error",
-        "sam (n = 2)",
-    )
-    assert all(words in page and words in said for words in (spread, number)) and of_one not in page
+    spread, of_one = "stands the standard deviation over them", "Behind ± stands one standard error"
+    assert all(words in page and words in said for words in (spread, "sam (n = 2)")) and of_one not in page
     assert main(["compare", *runs, "--out", str(tmp_path / "runs")]) == 0
     page = (tmp_path / "runs/compare.html").read_text()
     assert of_one in page and spread not in page and "(n = " not in page and "probe's seed 0, on " in page
@@ -247,20 +247,13 @@ def test_probes_of_other_losses_are_not_compared(runs, capsys, no_pictures):
     refused(capsys, runs, "expected runs with the same loss", "L1 + 0.2 (1 − SSIM) in sam/0", "--loss 3dgs")
 
 
-def test_runs_trained_with_other_losses_are_probed_with_that_of_3dgs(runs, capsys, monkeypatch, no_pictures):
+def test_runs_trained_with_other_losses_are_probed_with_that_of_3dgs(runs, capsys, probed, no_pictures):
     changed(runs[1], loss=LossSettings(literal=True))
     for run in runs:
         shutil.rmtree(Path(run) / "probe")
     refused(capsys, runs, "; ".join(f"landscape probe {run}/checkpoint.pt --loss 3dgs" for run in runs))
-    asked = []
-
-    def probe(options, command) -> int:
-        asked.append((options.loss, command[-1]))
-        record(options.checkpoint.parent / "probe", 1.0)
-        return 0
-
-    monkeypatch.setattr("analysis.runs.compared.run_probe", probe)
-    assert main(["compare", *runs, "--probe"]) == 0 and asked == [("3dgs", "3dgs")] * 2
+    assert main(["compare", *runs, "--probe"]) == 0
+    assert [(options.loss, command[-1]) for options, command in probed] == [("3dgs", "3dgs")] * 2
 
 
 def test_trajectories_of_other_functions_are_not_drawn_into_one_picture(runs, capsys, monkeypatch):
@@ -273,22 +266,14 @@ def test_trajectories_of_other_functions_are_not_drawn_into_one_picture(runs, ca
     assert "expected runs with the same loss" in capsys.readouterr().err
 
 
-def test_a_run_without_a_record_is_refused_with_the_command_or_probed(runs, capsys, monkeypatch, no_pictures):
+def test_a_run_without_a_record_is_refused_with_the_command_or_probed(runs, capsys, probed, no_pictures):
     for run in runs:
         shutil.rmtree(Path(run) / "probe")
     earlier = own(Path(runs[1]))["fingerprint"] | {"state": "of an earlier step"}
     record(Path(runs[1]) / "probe", 1.0, fingerprint=earlier)
     commands = [f"landscape probe {run}/checkpoint.pt" for run in runs]
     refused(capsys, runs, "expected probed runs", "; ".join(commands), "--probe")
-    asked = []
-
-    def probe(options, command) -> int:
-        asked.append(" ".join(command))
-        record(options.checkpoint.parent / "probe", 1.0)
-        return 0
-
-    monkeypatch.setattr("analysis.runs.compared.run_probe", probe)
-    assert main(["compare", *runs, "--probe"]) == 0 and asked == commands
+    assert main(["compare", *runs, "--probe"]) == 0 and [" ".join(command) for _, command in probed] == commands
     assert (Path(runs[0]).parents[1] / "compare/compare.csv").exists()
 
 
@@ -316,10 +301,8 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",
     ):
         assert part in said
-        page = (
-            (Path(runs[0]).parents[1] / "compare/compare.html").read_text().replace("<code>", "").replace("</code>", "")
-        )
-        assert part in " ".join(page.split())
+        page = (Path(runs[0]).parents[1] / "compare/compare.html").read_text()
+        assert part in " ".join(page.replace("<code>", "").replace("</code>", "").split())
 
 
 def test_what_holds_of_many_runs_is_said_once_and_seeds_may_differ(runs, capsys, no_pictures):
@@ -398,16 +381,10 @@ def replaced(run: str) -> None:
     save_checkpoint(Path(run) / "checkpoint.pt", loaded.training, loaded.scene)
 
 
-def test_records_of_a_checkpoint_that_was_replaced_are_refused_or_measured_anew(runs, capsys, monkeypatch, no_pictures):
+def test_records_of_a_checkpoint_that_was_replaced_are_refused_or_measured_anew(runs, capsys, probed, no_pictures):
     replaced(runs[0])
     refused(capsys, runs, f"no record of the checkpoint in {runs[0]}, where {runs[0]}/probe is of another; run land")
-
-    def probe(options, command) -> int:
-        record(options.checkpoint.parent / "probe", 1.0)
-        return 0
-
-    monkeypatch.setattr("analysis.runs.compared.run_probe", probe)
-    assert main(["compare", *runs, "--probe"]) == 0
+    assert main(["compare", *runs, "--probe"]) == 0 and len(probed) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert f"{runs[0]}/probe was of another checkpoint or renderer, and has been measured anew" in said
     assert f"left out: expected in {runs[0]}/metrics.json a record of the checkpoint beside it, got one" in said

@@ -20,6 +20,7 @@ from figures.make_all import recorded_figures
 from figures.plane import plane
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
+from splat.model.gaussians import Gaussians
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.adam import Adam
@@ -34,25 +35,26 @@ POINTS = ["--points", "9", "--all-points"]
 EPS = np.finfo(np.float64).eps
 
 
-def save_double(checkpoint: Path, out: Path, change=lambda gaussians: None) -> None:
-    """The checkpoint in double precision, changed in place."""
+def save_double(checkpoint: Path, out: Path, change=lambda gaussians: gaussians) -> None:
+    """The checkpoint in double precision, with other Gaussians."""
     loaded = load_checkpoint(checkpoint)
-    gaussians = loaded.training.gaussians.to(torch.float64)
-    change(gaussians)
+    gaussians = change(loaded.training.gaussians.to(torch.float64))
     state = Adam.zero(gaussians), ScreenGradients.zero(len(gaussians), torch.float64)
     training = replace(loaded.training, gaussians=gaussians, adam=state[0], screen_gradients=state[1])
     save_checkpoint(out, training, loaded.scene)
 
 
-def behind(gaussians) -> None:
+def behind(gaussians: Gaussians) -> Gaussians:
     """One Gaussian out of every view's sight."""
     gaussians.means[0] += 1e4
+    return gaussians
 
 
-def turned(gaussians) -> None:
+def turned(gaussians: Gaussians) -> Gaussians:
     """Other parameters with a quaternion of the other sign and another length."""
     gaussians.flat.add_(0.01 * torch.randn(gaussians.flat.shape, generator=torch.Generator().manual_seed(5)))
     gaussians.quats[3] *= -2.5
+    return gaussians
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +67,7 @@ def run(tmp_path_factory) -> Path:
     save_double(out / "checkpoint.pt", out / "double.pt")
     save_double(out / "checkpoint.pt", out / "behind.pt", behind)
     save_double(out / "checkpoint.pt", out / "turned.pt", turned)
+    save_double(out / "checkpoint.pt", out / "few.pt", lambda gaussians: gaussians.select(torch.arange(9)))
     return out
 
 
@@ -100,9 +103,7 @@ def check_renders(record: Record, objective: SceneObjective) -> None:
     assert arrays["loss"].ravel()[known].tolist() == pytest.approx(truth, rel=1e-12)
     span = SceneHessian(objective, keep_null=True).apply(vectors).T @ vectors
     slope = vectors.T @ objective.gradient
-    model = (
-        truth[0] * 0 + objective.loss(objective.active.flat) + points @ slope + ((points @ span) * points).sum(1) / 2
-    )
+    model = objective.loss(objective.active.flat) + points @ slope + ((points @ span) * points).sum(1) / 2
     assert arrays["model"].ravel().tolist() == pytest.approx(model.tolist(), rel=1e-9)
     for direction, curvature, first in zip(record.data.slice.directions, span.diagonal(), slope, strict=True):
         assert direction.curvature == pytest.approx(float(curvature), rel=1e-9)
@@ -210,13 +211,12 @@ def test_finite_steps_are_said_as_a_range_without_those_that_are_hidden():
     assert "from 41.0 to 70.0, at the 3 of 4 steps that round-off does not hide (±1.00 × 10⁻⁵ to ±0.00100)" in said
     assert said.endswith(", 2 of them with another order of splats")
     hidden = probe | {"curvatures": [None] * 4, "round_off": [None] * 4, "crossed": None}
-    assert (
-        _finite_curvature(convert(hidden, FiniteProbe))
-        == "at finite steps: round-off hides the curvature at all 4 steps"
-    )
+    said = _finite_curvature(convert(hidden, FiniteProbe))
+    assert said == "at finite steps: round-off hides the curvature at all 4 steps"
 
 
 def test_a_line_leads_to_the_other_checkpoint_with_all_gaussians(run, tmp_path):
+    gaussians = load_checkpoint(run / "double.pt").training.gaussians
     for start, end in (("behind", "double"), ("double", "turned")):
         record = sliced(tmp_path / start, run / f"{start}.pt", str(run / f"{end}.pt"), "--points", "9", "--all-points")
         x, loss = record.arrays["slice"]["x"], record.arrays["slice"]["loss"]
@@ -225,11 +225,7 @@ def test_a_line_leads_to_the_other_checkpoint_with_all_gaussians(run, tmp_path):
             objective = objective_of(run / f"{name}.pt")
             truth = objective.loss(objective.active.flat)
             assert float(loss[x == at][0]) == pytest.approx(truth, rel=1e-12)
-        assert record.arrays["directions"]["vectors"].shape == (
-            len(load_checkpoint(run / "double.pt").training.gaussians.flat),
-            1,
-        )
-    gaussians = load_checkpoint(run / "double.pt").training.gaussians
+        assert record.arrays["directions"]["vectors"].shape == (len(gaussians.flat), 1)
     way = gaussians.with_flat(torch.from_numpy(record.arrays["directions"]["vectors"][:, 0])).quats
     assert way.norm(dim=1).max() <= math.sqrt(2)  # unit quaternions that turn the same way, the shorter one
 
@@ -304,16 +300,6 @@ def test_a_plane_leads_through_three_checkpoints(run, tmp_path):
     assert plane(record).others == [(1.0, 0.0), (0.0, 1.0)]
 
 
-def few(run: Path, tmp_path: Path) -> str:
-    """A checkpoint with other Gaussians."""
-    loaded = load_checkpoint(run / "double.pt")
-    gaussians = loaded.training.gaussians.select(torch.arange(9))
-    state = Adam.zero(gaussians), ScreenGradients.zero(len(gaussians), torch.float64)
-    training = replace(loaded.training, gaussians=gaussians, adam=state[0], screen_gradients=state[1])
-    save_checkpoint(tmp_path / "few.pt", training, loaded.scene)
-    return str(tmp_path / "few.pt")
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -335,10 +321,8 @@ def few(run: Path, tmp_path: Path) -> str:
     ],
 )
 def test_bad_input_gets_one_sentence_and_leaves_no_record(run, tmp_path, capsys, options, words):
-    named = {"BEHIND": "behind", "OTHER": "turned", "SAME": "double"}
+    named = {"BEHIND": "behind", "OTHER": "turned", "SAME": "double", "FEW": "few"}
     named = {key: str(run / f"{name}.pt") for key, name in named.items()} | {"NOWHERE": str(tmp_path / "nowhere.pt")}
-    if "FEW" in options:
-        named["FEW"] = few(run, tmp_path)
     out = tmp_path / "out" / "slice"
     arguments = [str(run / "double.pt"), *(named.get(option, option) for option in options), "--out", str(out)]
     assert main(["slice", *arguments]) == 2

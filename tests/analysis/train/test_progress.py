@@ -2,6 +2,8 @@
 
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -95,21 +97,28 @@ def test_the_oldest_of_those_that_stay_go_but_for_what_else_is_in_their_folders(
     assert {path.name for path in out.glob("step-*")} == {"step-10", "step-20", "step-25"}
 
 
-def test_a_row_is_there_when_it_is_made_and_a_resumed_run_continues_the_file(original, run, tmp_path, monkeypatch):
+@contextmanager
+def killed_at(step: int) -> Iterator[None]:
+    """A training that is killed where its row of that step is written and its checkpoint is not."""
+
     class Killed(BaseException):
         """Reported by no handler of errors."""
 
-    out = tmp_path / "run"
-
     def killed(path, training, reference):
-        if training.step == 20:  # its row is written, its checkpoint is not
+        if training.step == step:
             raise Killed
         save_checkpoint(path, training, reference)
 
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "save_checkpoint", killed)
         with pytest.raises(Killed):
-            main(words(original, out))
+            yield
+
+
+def test_a_row_is_there_when_it_is_made_and_a_resumed_run_continues_the_file(original, run, tmp_path):
+    out = tmp_path / "run"
+    with killed_at(20):
+        main(words(original, out))
     written = (out / "train.csv").read_text()
     assert [line.split(",")[0] for line in written.splitlines()] == ["step", "0", "10", "20"]
     (out / "train.csv").write_text(written + "2")  # of a line that was cut short

@@ -9,7 +9,6 @@ import torch
 from scipy.stats import t as student
 
 from analysis.commands.cli import main
-from analysis.train import command
 from analysis.train.trajectory import COLUMNS, Trajectory, TrajectorySettings, measure
 from landscape import extreme_eigenpairs
 from landscape.errors import InputError
@@ -20,7 +19,8 @@ from splat.model.gaussians import ATTRIBUTES
 from splat.model.untrusted import read_table
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.checkpoint import load_checkpoint
+from tests.analysis.train.test_progress import killed_at
 
 STEPS, EVERY = 40, 10
 TIMES = ["seconds"]
@@ -133,20 +133,10 @@ def test_the_start_is_kept_and_finds_its_scene(run):
     assert (path.parent / loaded.scene.relative).resolve() == loaded.with_scene(path).scene.root.resolve()
 
 
-def test_a_run_killed_beside_a_checkpoint_and_resumed_gives_the_same_rows(scene, run, monkeypatch):
-    class Killed(BaseException):
-        """Reported by no handler of errors."""
-
-    def killed(path, training, reference):
-        if training.step == 30:
-            raise Killed
-        save_checkpoint(path, training, reference)
-
+def test_a_run_killed_beside_a_checkpoint_and_resumed_gives_the_same_rows(scene, run):
     out = scene.parent / "killed"
-    with monkeypatch.context() as patch:
-        patch.setattr(command, "save_checkpoint", killed)
-        with pytest.raises(Killed):
-            main(probed(scene, "killed"))
+    with killed_at(30):
+        main(probed(scene, "killed"))
     assert list(rows(out)["step"]) == [0, 10, 20, 30]  # the last of them is after the checkpoint, of step 20
     assert main(probed(scene, "killed", "--resume")) == 0
     pd.testing.assert_frame_equal(rows(out).drop(columns=TIMES), rows(run).drop(columns=TIMES), check_exact=True)

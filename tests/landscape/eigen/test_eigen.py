@@ -24,6 +24,21 @@ def solved(name, case, dtype):
     return H, extreme_eigenpairs(H, generator(), SETTINGS[case])
 
 
+class Diagonal:
+    """An operator of more rows than a matrix may have."""
+
+    def __init__(self, values):
+        self.values, self.dim, self.dtype, self.blocks = (
+            values,
+            len(values),
+            values.dtype,
+            {"all": slice(0, len(values))},
+        )
+
+    def apply(self, V):
+        return self.values[:, None] * V
+
+
 def both(ends):
     return (ends.largest, ends.smallest)
 
@@ -31,35 +46,25 @@ def both(ends):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("case", SETTINGS)
 @pytest.mark.parametrize("name", SPECTRA)
-def test_a_true_eigenvalue_lies_within_each_residual_and_ends_are_ends(name, case, dtype):
+def test_residuals_are_of_orthonormal_vectors_and_reach_a_true_eigenvalue_and_ends_are_ends(name, case, dtype):
     H, ends = solved(name, case, dtype)
-    true = eigenvalues(H)
+    true, unit = eigenvalues(H), torch.finfo(dtype).eps
     # the residual itself is measured with a rounded product
-    rounding = 4 * torch.finfo(dtype).eps * float(true.abs().max())
+    rounding = 4 * unit * float(true.abs().max())
     for pairs in both(ends):
         nearest = (pairs.values[:, None] - true).abs().min(dim=1).values
         assert (nearest <= pairs.residuals + rounding).all()
-    # in a cluster closer than the tolerance the outermost eigenvalue may lie outside the residual, not the tolerance
-    for pairs, outside in ((ends.largest, true[-1]), (ends.smallest, true[0])):
-        asked = max(float(pairs.residuals[0]), SETTINGS[case].rtol * abs(float(pairs.values[0])))
-        assert abs(pairs.values[0] - outside) <= asked + rounding
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("case", SETTINGS)
-@pytest.mark.parametrize("name", SPECTRA)
-def test_residuals_belong_to_the_vectors_and_vectors_are_orthonormal(name, case, dtype):
-    H, ends = solved(name, case, dtype)
-    unit = torch.finfo(dtype).eps
-    for pairs in both(ends):
         V = pairs.vectors.double()
         residuals = (H.matrix.double() @ V - pairs.values * V).norm(dim=0)
-        rounding = 10 * unit * float(H.matrix.norm())
-        assert ((residuals - pairs.residuals).abs() <= rounding).all()
+        assert ((residuals - pairs.residuals).abs() <= 10 * unit * float(H.matrix.norm())).all()
         assert (V.T @ V - torch.eye(len(pairs))).abs().max() < N * unit
         assert (V.amax(dim=0) == V.abs().amax(dim=0)).all()  # the sign is that of the largest entry
         if pairs.reason == "tolerance":
             assert (pairs.residuals <= SETTINGS[case].rtol * pairs.values.abs()).all()
+    # in a cluster closer than the tolerance the outermost eigenvalue may lie outside the residual, not the tolerance
+    for pairs, outside in ((ends.largest, true[-1]), (ends.smallest, true[0])):
+        asked = max(float(pairs.residuals[0]), SETTINGS[case].rtol * abs(float(pairs.values[0])))
+        assert abs(pairs.values[0] - outside) <= asked + rounding
 
 
 @pytest.mark.parametrize("case", SETTINGS)
@@ -137,16 +142,16 @@ def test_noise_along_the_end_vectors_alone_is_measured_at_once():
     """In proportion to the product: small on the random start, large where the run is going."""
     source, n = generator(1), 20_000
 
-    class Noisy:
-        dim, dtype, blocks = n, torch.float64, {"all": slice(0, n)}
-
+    class Noisy(Diagonal):
         def apply(self, V):
-            exact = V / torch.arange(1, n + 1)[:, None]
+            exact = super().apply(V)
             return exact + 1e-4 * exact.norm(dim=0) / n**0.5 * torch.randn(V.shape, generator=source, dtype=V.dtype)
 
     steps = []
     settings = EigenSettings(1, 0, rtol=1e-5)
-    ends = extreme_eigenpairs(Noisy(), generator(1), settings, progress=lambda *state: steps.append(state))
+    ends = extreme_eigenpairs(
+        Noisy(1 / torch.arange(1, n + 1).double()), generator(1), settings, progress=lambda *state: steps.append(state)
+    )
     assert ends.largest.reason == "noise floor" and 1e-4 < ends.noise < 2e-4
     # the steps, the noise of a vector on the way, one product for all pairs and one of the pair's own
     assert ends.matvecs == len(steps) + 3
@@ -171,10 +176,8 @@ def test_the_noise_of_a_product_follows_from_the_asymmetry_of_components(basis):
         def apply(self, V):
             return super().apply(V) + noise / N**0.5 * torch.randn(V.shape, generator=source, dtype=V.dtype)
 
-    settings = EigenSettings(basis=basis)
-    ends = extreme_eigenpairs(
-        Noisy(operator("indefinite").matrix), generator(), settings, None, lambda *s: steps.append(s)
-    )
+    H = Noisy(operator("indefinite").matrix)
+    ends = extreme_eigenpairs(H, generator(), EigenSettings(basis=basis), None, lambda *s: steps.append(s))
     assert ends.matvecs == 1 + len(steps)  # after the first there is no pair yet
     pairs = ends.matvecs * (ends.matvecs - 1) / 2 if basis == 64 else ends.matvecs * basis * 0.6
     assert ends.noise == pytest.approx(noise, rel=4 / (2 * pairs) ** 0.5)
@@ -184,19 +187,12 @@ def test_the_noise_of_a_product_follows_from_the_asymmetry_of_components(basis):
 
 def test_of_long_float32_vectors_one_product_measures_the_residuals():
     n, steps = 100_000, []
-
-    class Long:
-        dim, dtype, blocks = n, torch.float32, {"all": slice(0, n)}
-        diagonal = torch.where(torch.arange(n) % 3 > 0, 1.0, -0.1) / torch.arange(1, n + 1) ** 0.7
-
-        def apply(self, V):
-            return self.diagonal[:, None] * V
-
-    ends = extreme_eigenpairs(Long(), generator(), progress=lambda *state: steps.append(state))
+    diagonal = torch.where(torch.arange(n) % 3 > 0, 1.0, -0.1) / torch.arange(1, n + 1) ** 0.7
+    ends = extreme_eigenpairs(Diagonal(diagonal), generator(), progress=lambda *state: steps.append(state))
     assert ends.matvecs == 1 + len(steps) + 2  # and one for the noise on the way, as the lower end's goal is near it
-    for pairs, end in ((ends.largest, Long.diagonal.max()), (ends.smallest, Long.diagonal.min())):
+    for pairs, end in ((ends.largest, diagonal.max()), (ends.smallest, diagonal.min())):
         v = pairs.vectors[:, 0].double()
-        residual = float((Long.diagonal.double() * v - pairs.values[0] * v).norm())
+        residual = float((diagonal.double() * v - pairs.values[0] * v).norm())
         # each pair's estimate has the noise of both
         assert pairs.reason == "tolerance" and residual <= float(pairs.residuals[0]) + 2 * ends.noise
         assert abs(float(pairs.values[0]) - float(end)) <= residual
@@ -273,9 +269,7 @@ def test_no_eigenvalue_lies_beyond_the_stated_bound(warm):
 def test_the_bound_of_a_start_that_is_mostly_given_is_the_wider_one():
     H = operator("negative")
     settings = EigenSettings(rtol=1e-12, max_matvecs=25)
-    cold, warm = (
-        extreme_eigenpairs(H, generator(), settings, start=start) for start in (None, torch.eye(H.dim)[:, :1])
-    )
+    cold, warm = (extreme_eigenpairs(H, generator(), settings, start) for start in (None, torch.eye(H.dim)[:, :1]))
     n, m = H.dim, warm.matvecs - 2  # of which the two last measure the residuals
     share = (log(2 * 1.648 * sqrt(n) / (0.01 / 2)) / (2 * m - 1)) ** 2
     width = float(warm.largest.values[0] - warm.smallest.values[0])
@@ -345,14 +339,7 @@ def test_pairs_of_a_null_space_are_not_taken_from_the_other_end(rank, largest, s
 def test_one_value_is_not_settled_by_the_first_product():
     values = torch.ones(100_000)
     values[7] = 4.0
-
-    class Diagonal:
-        dim, dtype, blocks = len(values), values.dtype, {"all": slice(0, len(values))}
-
-        def apply(self, V):
-            return values[:, None] * V
-
-    ends = extreme_eigenpairs(Diagonal(), torch.Generator().manual_seed(0), EigenSettings(1, 0, rtol=1e-2))
+    ends = extreme_eigenpairs(Diagonal(values), torch.Generator().manual_seed(0), EigenSettings(1, 0, rtol=1e-2))
     assert float(ends.largest.values[0]) == pytest.approx(4.0, rel=1e-3)
 
 

@@ -204,10 +204,7 @@ SHARED = torch.ones(3)
 KINDS = {
     "half precision": ({"x": torch.ones(3, dtype=torch.bfloat16)}, r"got torch\.bfloat16 on cpu in x; convert"),
     "complex": ({"x": torch.ones(3, dtype=torch.complex64)}, "view_as_real"),
-    "two dtypes": (
-        {"x": torch.ones(3), "y": torch.ones(3).double()},
-        r"float32 on cpu in x and torch\.float64 on cpu in y",
-    ),
+    "two dtypes": ({"x": SHARED, "y": SHARED.double()}, r"float32 on cpu in x and torch\.float64 on cpu in y"),
     "two devices": ({"x": torch.ones(3), "y": torch.ones(3, device="meta")}, "on cpu in x and .* on meta in y"),
     "none": ({}, "got none"),
     "a list": ({"x": [1.0]}, "got list in x"),
@@ -323,5 +320,4 @@ def test_vectors_of_another_dtype_or_device_are_refused():
 
 
 def test_an_error_of_the_loss_itself_stays_as_it_is():
-    with pytest.raises(RuntimeError, match="must match the size"):
-        ObjectiveHessian(lambda x: (x - torch.ones(4)).sum(), POINT)
+    refused("must match the size", ObjectiveHessian, lambda x: (x - torch.ones(4)).sum(), POINT, error=RuntimeError)

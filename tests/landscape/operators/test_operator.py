@@ -79,8 +79,7 @@ def test_a_flat_vector_is_refused_with_the_remedy(name):
 
 
 def test_a_vector_of_another_length_is_refused():
-    with pytest.raises(ValueError, match=r"with n = 7, got \(6, 2\)"):
-        DenseOperator(A).apply(torch.ones(6, 2))
+    misused(r"with n = 7, got \(6, 2\)", DenseOperator(A).apply, torch.ones(6, 2))
 
 
 def test_dense_refuses_what_is_not_a_symmetric_finite_matrix():

@@ -121,11 +121,8 @@ def test_a_needle_is_the_one_of_largest_condition():
 
 
 def test_a_blocker_that_one_view_sees_has_all_its_weight_there():
-    near = {
-        "means": [1.15, 0.0, 1.2],
-        "log_scales": [-2.0] * 3,
-        "opacity_logits": 5.0,
-    }  # before the second camera alone
+    # before the second camera alone
+    near = {"means": [1.15, 0.0, 1.2], "log_scales": [-2.0] * 3, "opacity_logits": 5.0}
     found, sights = scene_fields(scene_of([{}, near, {"means": [-0.5, 0.2, 4.0]}], [[-1.5, 0.0, 0.0], [1.5, 0.0, 0.0]]))
     assert found["views"].tolist() == [2, 1, 2] and found["one_view"][1].item() == 1
     assert not sights[0].seen[1] and sights[1].seen[1]

@@ -145,8 +145,7 @@ def test_coloured_pictures_of_16_bits_keep_all_of_them(tmp_path: Path, channels:
         stored(turn(pixels), b"eXIf" + exif.tobytes().removeprefix(b"Exif\0\0"))
         assert torch.equal(load_scene(tmp_path).load()[0].image, view.image), orientation
     (tmp_path / "images/a.png").write_bytes((tmp_path / "images/a.png").read_bytes()[:-40])
-    with pytest.raises(ValueError, match=r"cannot read .*a\.png"):
-        load_scene(tmp_path).load()
+    refused(r"cannot read .*a\.png", load_scene(tmp_path).load)
 
 
 @pytest.mark.parametrize("absurd", [{"k1": 1e30}, {"k1": -1e30}, {"k1": -20.0}, {"p2": 1e6}, {"k3": 1e300}])
@@ -280,8 +279,7 @@ def test_pictures_that_promise_too_much_or_are_damaged_inside_are_refused(tmp_pa
     path.write_bytes(png(160_000, 120_000, b"IDAT"))
     refused(r"cannot read .*c\.png.*exceeds limit", load_scene, tmp_path)
     path.write_bytes(png(*SIZE, b"IDAT" + zlib.compress(b"x"), b"\x91\x02\xe3|", b"IEND"))
-    with pytest.raises(ValueError, match=r"cannot read .*c\.png.*broken PNG"):
-        load_scene(tmp_path).load()
+    refused(r"cannot read .*c\.png.*broken PNG", load_scene(tmp_path).load)
 
 
 @pytest.mark.parametrize("mode", ["L", "P", "LA", "1"])

@@ -6,11 +6,11 @@ from math import exp, log
 import pytest
 import torch
 
-from landscape.errors import InputError
 from splat.model.gaussians import ATTRIBUTES, Gaussians
 from splat.projection.reference import Splats, on_screen
 from splat.render.render import render
 from splat.training.densify import DensifySettings, ScreenGradients, densify, reset_opacities
+from tests.refusals import refused
 from tests.splat.tiny import EXTENT, HEIGHT, WIDTH, tiny_gaussians, tiny_views
 
 SETTINGS = DensifySettings()
@@ -209,8 +209,7 @@ def test_density_control_that_is_switched_off_does_nothing():
 
 
 def test_a_reset_that_would_remove_every_gaussian_is_refused():
-    with pytest.raises(InputError, match="expected min_opacity < reset_opacity"):
-        DensifySettings(min_opacity=0.02)
+    refused("expected min_opacity < reset_opacity", DensifySettings, min_opacity=0.02)
 
 
 def test_every_attribute_of_a_densified_set_has_one_row_per_gaussian():

@@ -54,10 +54,8 @@ def test_intrinsics_of_a_frame_win_over_those_at_the_top(tmp_path: Path) -> None
 
 
 A, Z, NUMBER, LIST = "images/a.png", "images/z.png", "expected a finite number, got", "expected a list of file paths"
-ANGLE, SMALL = (
-    "expected camera_angle_x above 0 and below pi, got",
-    "'images/a.png' cannot be: expected at least 1 px a side",
-)
+ANGLE = "expected camera_angle_x above 0 and below pi, got"
+SMALL = "'images/a.png' cannot be: expected at least 1 px a side"
 FAR = [[1, 0, 0, 10**400], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 MIRROR, TWICE = (np.diag([scale, abs(scale), abs(scale), 1.0]).tolist() for scale in (-1.0, 2.0))
 SHEARED = [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

@@ -7,11 +7,11 @@ import pytest
 from analysis.console.overrides import overridden
 from analysis.train.command import OPTIONS
 from analysis.train.options import TrainOptions
-from landscape.errors import InputError
 from splat.model.typed import leaves
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets, table
 from splat.training.state import TrainConfig
+from tests.refusals import refused
 
 RELEASED = ("dropgaussian", "dropoutgs", "cor-gs", "fsgs", "dngaussian")  # with code
 SETTINGS = [row for row in table() if row["setting"] not in ("", "start")]
@@ -61,5 +61,4 @@ def test_no_preset_goes_before_an_option():
 @pytest.mark.parametrize("name", ["3dgs", "sam", "gn-cg"])
 def test_methods_without_a_published_training_are_refused(name):
     assert presets(name, "common") == {}
-    with pytest.raises(InputError, match="expected a method with a published training for llff"):
-        presets(name, "llff")
+    refused("expected a method with a published training for llff", presets, name, "llff")

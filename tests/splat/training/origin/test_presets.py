@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
@@ -52,14 +53,7 @@ def published(s: dict[str, np.ndarray], cap: float, near: float, cx: float, cy: 
         x, y, z = s["means"][i]
         if z <= near:
             continue
-        w, a, b, c = s["quats"][i] / np.linalg.norm(s["quats"][i])
-        turn = np.array(
-            [
-                [1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)],
-                [2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)],
-                [2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)],
-            ]
-        )
+        turn = Rotation.from_quat(np.roll(s["quats"][i], -1)).as_matrix()  # which has the real part last
         J = np.array([[FX / z, 0, -FX * x / z**2], [0, FY / z, -FY * y / z**2]])
         half = J @ turn @ np.diag(s["scales"][i])
         inverse = np.linalg.inv(half @ half.T + BLUR * np.eye(2))

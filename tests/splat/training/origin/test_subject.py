@@ -16,6 +16,7 @@ from splat.training.origin import subject
 from splat.training.origin.options import Foreign
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig, Training
+from tests.refusals import refused
 
 MADE = synthetic_scene(SyntheticSettings(gaussians=50, views=5, width=24, height=18))
 
@@ -50,8 +51,7 @@ def test_views_and_loss_are_those_of_the_training_unless_others_are_named(run):
 
 def test_a_scene_that_moved_is_named_and_fewer_views_are_spread(run):
     moved = (run.parent / "scene").rename(run.parent / "moved")
-    with pytest.raises(FileNotFoundError, match="--scene"):
-        open_subject(run)
+    refused("--scene", open_subject, run, error=FileNotFoundError)
     found = open_subject(run, Foreign(scene=moved, max_views=2))
     assert len(found.checkpoint.scene.train) == 2 and found.checkpoint.all_views == 3 and found.scene.root == moved
 
@@ -61,5 +61,4 @@ def test_pictures_that_do_not_fit_are_refused_before_they_are_read(run, monkeypa
     two = subject.COPIES * found.checkpoint.training.gaussians.flat.nbytes + 2 * subject.PLANES * 4 * 24 * 18
     for room, remedy in ((0, "allow or free at least"), (two, "--max-views 2 would fit")):
         monkeypatch.setattr(subject, "free_memory", lambda _, room=room: room)
-        with pytest.raises(TooLittleMemory, match=remedy):
-            found.objective()
+        refused(remedy, found.objective, error=TooLittleMemory)

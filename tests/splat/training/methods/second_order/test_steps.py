@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from landscape.errors import InputError
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
@@ -21,6 +20,7 @@ from splat.training.methods.second_order.newton_blocks import NewtonBlocks, mini
 from splat.training.methods.second_order.steps import FALLS, RISES, LocalModel, SecondOrder
 from splat.training.state import Training
 from tests.oracles import absolute_matrix
+from tests.refusals import refused
 from tests.splat.tiny import EXTENT, ended, tiny_config, tiny_gaussians, tiny_views
 
 L2, SSIM = LossSettings("l2", ssim_weight=0.0), LossSettings("l2", ssim_weight=0.3)
@@ -175,8 +175,7 @@ def test_the_loss_of_a_step_is_the_mean_over_all_views_with_a_smooth_l1():
 
 
 def test_a_clamped_image_is_refused():
-    with pytest.raises(InputError, match="expected clamp_image=false for gn-cg"):
-        steps(GaussNewtonCG(), tiny_gaussians(), 1, clamp_image=True)
+    refused("expected clamp_image=false for gn-cg", steps, GaussNewtonCG(), tiny_gaussians(), 1, clamp_image=True)
 
 
 def test_absolute_values_are_those_of_eigenvalues_and_leave_what_is_positive():
