@@ -72,7 +72,7 @@ def _run(
     """The probe in this process.  ranks: of the processes that share the views, where there are several."""
     start = perf_counter()
     out = options.out or options.checkpoint.parent / ("probe-quick" if options.quick else "probe")
-    families = _family_options(options)
+    settings, families = probe_settings(options, views=1), _family_options(options)  # before anything is loaded
     if ranks is not None and families is not None:
         raise InputError(
             "expected no --per-attribute, --split-control or --metric under torchrun, got one; run it in one process"
