@@ -137,9 +137,8 @@ def page(table: pd.DataFrame) -> str:
 
 def _text(row: dict) -> str:
     time = f"{row['cpu']:.2g} s" if row["what"] == "step" else f"{row['cpu']:,.0f} s"
-    ended = (
-        row["ended"] if isinstance(row["ended"], str) else ""
-    )  # a limit is one of the clock, the table of the processor
+    ended = row["ended"] if isinstance(row["ended"], str) else ""
+    # a limit is one of the clock, the table one of the processor
     return f"{f'more than {time}' if ended.startswith('more') else ended or time}, {row['memory']:.1f} GiB"
 
 

@@ -28,7 +28,6 @@ from splat.losses.autograd import view_loss
 from splat.losses.reference import LossSettings
 from splat.render.backend import backend_of
 
-View = tuple[Any, Mapping[str, Any]]  # of nerfstudio
 STORED = {  # by graphdeco, gsplat and nerfstudio's splatfacto
     "means": ("_xyz", "means", "means"),
     "log_scales": ("_scaling", "scales", "scales"),
@@ -102,7 +101,7 @@ def gsplat_hessian(
     return RendererHessian(image_of, stored, lambda image, i: _exact_loss(image, targets[i], loss), range(len(targets)))
 
 
-def nerfstudio_hessian(model: Any, views: Sequence[View], groups: Sequence[str] | None = None) -> RendererHessian:
+def nerfstudio_hessian(model: Any, views: Sequence[tuple], groups: Sequence[str] | None = None) -> RendererHessian:
     """The Hessian of the mean loss over views, pairs of rays (or a camera) and their batch, at a model in `eval()`.
 
     groups: of the parameters, all by default; each is a block.  Terms of the loss that do not read the picture are constants:
@@ -129,12 +128,13 @@ def nerfstudio_hessian(model: Any, views: Sequence[View], groups: Sequence[str] 
     }
     others: dict[str, Any] = {}
 
-    def image_of(view: View) -> Tensor:
+    def image_of(view: tuple) -> Tensor:
+        others.clear()  # what lists keep of the last view's graph
         outputs = model(view[0])
         others.update({name: each.detach() if isinstance(each, Tensor) else each for name, each in outputs.items()})
         return outputs["rgb"]
 
-    def loss_of(image: Tensor, view: View) -> Tensor:
+    def loss_of(image: Tensor, view: tuple) -> Tensor:
         losses = model.get_loss_dict(others | {"rgb": image}, view[1])
         return torch.stack([value.reshape(()) for value in losses.values() if isinstance(value, Tensor)]).sum()
 
