@@ -46,13 +46,19 @@ def bordered_rows(like, fields, frame):
 
 @formula
 def ring_buffer(like, fields, frame):
-    return scratch(like, fields * RING * frame.stride)
+    return scratch(like, fields * RING * ring_pitch(frame))
+
+
+@formula
+def ring_pitch(frame):
+    """Numbers from a row of a ring to the next: an odd number of 16, so that its rows do not share sets of the cache."""
+    return ((frame.stride + 15) // 16 | 1) * 16
 
 
 @formula
 def ring_row(field, y, frame):
     """The place of row y of a field in a ring."""
-    return (field * RING + (y & (RING - 1))) * frame.stride
+    return (field * RING + (y & (RING - 1))) * ring_pitch(frame)
 
 
 @formula
