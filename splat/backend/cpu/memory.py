@@ -1,4 +1,4 @@
-"""Arrays that start on a cache line, the height of a tile of pixels, and rows of numbers in the lanes of vectors.
+"""Arrays that start on a cache line, rows of numbers in the lanes of vectors, and vectors and tiles of pixels.
 
 A block holds a few things, such as Gaussians, a thing in each lane of float64: a row of lanes for each of its numbers.  Its
 rows are transposed in registers, as many at a time as there are lanes:
@@ -8,11 +8,18 @@ rows are transposed in registers, as many at a time as there are lanes:
     store_rows(a, at, k, last, count, block, row)    the other way; numbers from `count` on stay as they are
     neighbours(a, at)                                vectors of a[at + t], t = 1, ..., 5, -1, ..., -5; `at` aligned
 
+A vector of pixels holds PIXEL_ROWS rows of pixels, one after the other:
+
+    load_pixels(a, at, stride), store_pixels(a, at, stride, v)   its first row at a[at], the next one at a[at + stride]
+    pixel_columns(a), pixel_rows(a)                  the column and the row of each of its pixels; a names the dtype
+
 a: an array of floats, C-contiguous; `at` counts its numbers.
 """
 
 # pyright: reportOptionalCall=false
 # (numba declares its decorators as None until they are set up)
+
+import operator
 
 import numpy as np
 from llvmlite import ir
@@ -33,7 +40,9 @@ from splat.backend.cpu.simd import (
     store,
 )
 
-TILE_ROWS = 16
+PIXEL_ROWS = 2  # of a vector of pixels
+TILE_ROWS = 32  # vectors of pixels, one below the other
+TILE_HEIGHT = PIXEL_ROWS * TILE_ROWS
 
 
 @formula
@@ -146,6 +155,57 @@ def neighbours(typing, array, at):
         return context.make_tuple(builder, many, [builder.bitcast(value, vector.llvm) for value in values])
 
     return many(array, at), generate
+
+
+def _parts(context, builder, sig, args, vector):
+    """Addresses of a vector's rows of pixels, and the type of one."""
+    address, stride = address_of(context, builder, sig, args), context.cast(builder, args[2], sig.args[2], types.intp)
+    part = VectorType(vector.dtype, vector.lanes // PIXEL_ROWS)
+    return [builder.gep(address, [builder.mul(stride, I64(row))]) for row in range(PIXEL_ROWS)], part
+
+
+@intrinsic
+def load_pixels(typing, plane, at, stride):
+    vector = VectorType(plane.dtype)
+
+    def generate(context, builder, sig, args):
+        addresses, part = _parts(context, builder, sig, args, vector)
+        rows = [load_at(builder, address, part) for address in addresses]
+        return builder.shuffle_vector(*rows, ir.Constant(ir.VectorType(I32, vector.lanes), list(range(vector.lanes))))
+
+    return vector(plane, at, stride), generate
+
+
+@intrinsic
+def store_pixels(typing, plane, at, stride, value):
+    vector = VectorType(plane.dtype)
+
+    def generate(context, builder, sig, args):
+        addresses, part = _parts(context, builder, sig, args, vector)
+        for row, address in enumerate(addresses):
+            lanes = [row * part.lanes + lane for lane in range(part.lanes)]
+            value = builder.shuffle_vector(args[3], args[3], ir.Constant(ir.VectorType(I32, part.lanes), lanes))
+            builder.store(value, builder.bitcast(address, part.llvm.as_pointer())).align = vector.bits // 8
+        return context.get_dummy_value()
+
+    return types.void(plane, at, stride, vector), generate
+
+
+def _constant(like, number_of):
+    """A vector of a number of each lane, and the number of lanes in a row of pixels."""
+    vector = VectorType(like.dtype)
+    numbers = [float(number_of(lane, vector.lanes // PIXEL_ROWS)) for lane in range(vector.lanes)]
+    return vector(like), lambda *_: ir.Constant(vector.llvm, numbers)
+
+
+@intrinsic
+def pixel_columns(typing, like):
+    return _constant(like, operator.mod)
+
+
+@intrinsic
+def pixel_rows(typing, like):
+    return _constant(like, operator.floordiv)
 
 
 @formula

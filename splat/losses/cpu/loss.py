@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from splat.backend.cpu.memory import TILE_ROWS, aligned
+from splat.backend.cpu.memory import TILE_HEIGHT, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
 from splat.losses.cpu.sweeps import (
@@ -53,7 +53,7 @@ class CpuImageLoss:
     def __init__(self, shape: Sequence[int], settings: LossSettings, dtype: type | np.dtype):
         _, height, width = shape
         stride = -(-width // lanes_of(dtype)) * lanes_of(dtype)
-        plane_rows = -(-height // TILE_ROWS) * TILE_ROWS
+        plane_rows = -(-height // TILE_HEIGHT) * TILE_HEIGHT
         self.dtype = np.dtype(dtype)
         self.frame = Frame(height, width, plane_rows, stride, window(torch.float64).numpy().astype(dtype))
         scalar, self.structural = self.dtype.type, settings.structural(height, width)

@@ -10,8 +10,8 @@ from math import floor
 import numpy as np
 
 from splat.backend.cpu.jit import kernel
-from splat.backend.cpu.memory import TILE_ROWS, gather, scatter, scratch, store_all
-from splat.backend.cpu.simd import lanes, lanes_of, load_all, select
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, gather, scatter, scratch, store_all
+from splat.backend.cpu.simd import broadcast, iota, lanes, lanes_of, load_all, prefetch, select
 from splat.backend.cpu.threads import over_range
 from splat.render.cpu.tile import Lists
 from splat.render.formulas import SPLAT, Thresholds, box_of, ellipse_of, rows_of_strip
@@ -50,13 +50,14 @@ def radix_argsort(keys, index):
 
 
 BOX = 7  # numbers of a box: those of `ellipse_of`; first and last column of tiles; number of tiles
+AHEAD = 12  # splats between a prefetch and its use
 BOX_AT, ROWS = 16, 24  # rows of a block of splats
 
 
 @kernel
 def find_boxes(start, stop, splats, tile, width, height, alpha_min, contour, boxes):
     """Fill boxes (n, BOX)."""
-    block, across, down = scratch(np.empty(0), ROWS * lanes(np.empty(0))), 1 / tile, 1 / TILE_ROWS
+    block, across, down = scratch(np.empty(0), ROWS * lanes(np.empty(0))), 1 / tile, 1 / TILE_HEIGHT
     for i in range(start, stop, lanes(block)):
         gather(splats, SPLAT, i, stop, block, 0)
         splat = load_all(block, 0, 6)
@@ -70,17 +71,29 @@ def find_boxes(start, stop, splats, tile, width, height, alpha_min, contour, box
 
 @kernel
 def list_tiles(start, stop, splats, order, boxes, tile, columns, width, height, place, count, tiles, rows):
-    """The tiles that each splat touches and its rows in them, at place[i], place[i] + 1, ...; count[i] of them."""
+    """The tiles that each splat touches and its rows in them, at place[i], place[i] + 1, ...; count[i] of them.
+
+    The strips of a splat, a column of tiles each, lie in the lanes of vectors.
+    """
+    L = lanes(np.empty(0))
+    block = scratch(np.empty(0), 2 * L)
     for i in range(start, stop):
-        s, k = order[i], place[i]
+        s, k, later = order[i], place[i], np.int64(order[min(i + AHEAD, stop - 1)])
+        prefetch(splats, later * SPLAT)
+        prefetch(boxes, later * BOX)
         if place[i + 1] > k:
             splat = (splats[s, 0], splats[s, 1], splats[s, 2], splats[s, 3], splats[s, 4])
-            ellipse = (boxes[s, 0], boxes[s, 1], boxes[s, 2], boxes[s, 3])
-            for column in range(int(boxes[s, 4]), int(boxes[s, 5]) + 1):
-                y0, y1 = rows_of_strip(splat, ellipse, column, tile, width, height)
+            ellipse = (boxes[s, 0], boxes[s, 1], broadcast(block, boxes[s, 2]), boxes[s, 3])
+            first, last = int(boxes[s, 4]), int(boxes[s, 5])
+            for column in range(first, last + 1):
+                lane = (column - first) % L
+                if lane == 0:
+                    store_all(block, 0, rows_of_strip(splat, ellipse, column + iota(block), tile, width, height))
+                y0, y1 = int(block[lane]), int(block[L + lane])
                 if y0 <= y1:
-                    for row in range(y0 // TILE_ROWS, y1 // TILE_ROWS + 1):
-                        top, bottom = max(y0 - row * TILE_ROWS, 0), min(y1 - row * TILE_ROWS, TILE_ROWS - 1)
+                    for row in range(y0 // TILE_HEIGHT, y1 // TILE_HEIGHT + 1):
+                        top = max(y0 - row * TILE_HEIGHT, 0) // PIXEL_ROWS
+                        bottom = min(y1 - row * TILE_HEIGHT, TILE_HEIGHT - 1) // PIXEL_ROWS
                         tiles[k] = row * columns + column
                         rows[k] = top | bottom << 8
                         k += 1
@@ -109,9 +122,9 @@ def bin_splats(
     splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, thresholds: Thresholds
 ) -> Lists:
     """The tile lists of a view; the tiles are ordered heaviest first.  Accumulators come with `reached_lists`."""
-    tile = lanes_of(depths.dtype)
-    columns = -(-width // tile)
-    tile_count = columns * -(-height // TILE_ROWS)
+    tile = lanes_of(depths.dtype) // PIXEL_ROWS
+    columns = -(-width // (tile * PIXEL_ROWS)) * PIXEL_ROWS
+    tile_count = columns * -(-height // TILE_HEIGHT)
     order = depth_order(depths, drawn)
     boxes, limits = np.empty((len(splats), BOX)), (thresholds.alpha_min, thresholds.contour)
     over_range(len(splats), find_boxes, splats, tile, width, height, *limits, boxes)

@@ -4,7 +4,7 @@ The formulas stand in `render/formulas.py`, with alpha, w, T, R, s and beta as t
 the arrays in `tile.py`.  A kernel's thread takes tile after tile, and of each tile splat after splat; it keeps what each
 pixel has so far in `state`, row by row.
 
-L        lanes: the pixels of a tile's row, which are one vector
+L        lanes: the pixels of a tile's row, which are one vector (two rows of the image: `tile.py`)
 e, k     an intersection: its place in all lists, and its number in its tile, 0 in front
 u, v     whitened offset of a pixel from the splat's mean: u is the same in all rows of a tile, v follows by `row_v`
 terms    what gives v and log2 alpha of any row of the tile (`tile.alpha_terms`)
@@ -19,8 +19,16 @@ v_x      cotangent: the loss's derivative in x
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import TILE_ROWS, scratch
-from splat.backend.cpu.simd import any_lane, fma, lanes, load, maximum, prefetch, select, store
+from splat.backend.cpu.memory import (
+    PIXEL_ROWS,
+    TILE_ROWS,
+    load_pixels,
+    pixel_columns,
+    pixel_rows,
+    scratch,
+    store_pixels,
+)
+from splat.backend.cpu.simd import any_lane, broadcast, fma, lanes, load, maximum, prefetch, select, store
 from splat.render.cpu.tile import (
     AHEAD,
     BACKWARD,
@@ -37,11 +45,11 @@ from splat.render.cpu.tile import (
     corner_of,
     dark,
     intersection,
+    intersections_of,
     load3,
     load_cotangent,
     next_tile,
     no_moments,
-    reached,
     row_v,
     store3,
     store_moments,
@@ -59,25 +67,30 @@ def forward(counter, params, lists, frame, pixels):
     tile = next_tile(counter, lists)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
-        # nothing in front yet: T = 1, no pixel has stopped, black
+        # nothing in front yet: T = 1, black, and no pixel has stopped but those beyond the image
+        inside = pixel_columns(params) < broadcast(params, frame.width - x0)
         for y in range(TILE_ROWS):
             b = FORWARD * L * y
-            store(state, b + T * L, 1.0)
-            store(state, b + STOP * L, NEVER)
+            here = inside & (pixel_rows(params) < broadcast(params, frame.height - y0 - PIXEL_ROWS * y))
+            store(state, b + T * L, select(here, broadcast(params, 1.0), -1.0))
+            store(state, b + STOP * L, select(here, broadcast(params, NEVER), 0.0))
             store3(state, b + IMAGE * L, L, (0.0, 0.0, 0.0))
-        first = np.int64(lists.start[tile])
-        count = lists.start[tile + 1] - first
-        some_stopped = False
+        first, count = intersections_of(lists, tile)
+        some_stopped = True
         # front to back; every 16 splats, if a pixel has stopped since the last look: have all?
         for k in range(count):
             prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
             some_stopped |= composite(params, lists, first + k, k, x0, y0, frame, state)
             if some_stopped and (k & 15) == 15:
-                some_stopped = False
+                some_stopped = True
                 if all_stopped(state, L):
                     break
+        furthest = broadcast(params, 0.0)
         for y in range(TILE_ROWS):
-            end_row(state, FORWARD * L * y, L, frame, pixels, corner + y * frame.stride)
+            furthest = maximum(furthest, load(state, (FORWARD * y + STOP) * L))
+            end_row(state, FORWARD * L * y, L, frame, pixels, corner + PIXEL_ROWS * y * frame.stride)
+        store(state, 0, furthest)
+        pixels.reached[tile] = np.int64(min(count, state[:L].max()))
         tile = next_tile(counter, lists)
 
 
@@ -111,11 +124,13 @@ def end_row(state, b, L, frame, pixels, p):
     """Add the background to a row, and write its colour, alpha, final T and stops at p of each plane."""
     # the final T, of stopped pixels too
     last = maximum(load(state, b + T * L), -load(state, b + T * L))
-    store(pixels.transmittance, p, last)
-    store(pixels.stop, p, load(state, b + STOP * L))
+    stride = frame.stride
+    store_pixels(pixels.transmittance, p, stride, last)
+    store_pixels(pixels.stop, p, stride, load(state, b + STOP * L))
     image = plus(load3(state, b + IMAGE * L, L), last, frame.background)
-    store3(pixels.planes, p, frame.size, image)
-    store(pixels.planes, 3 * frame.size + p, 1.0 - last)
+    for c in range(3):
+        store_pixels(pixels.planes, c * frame.size + p, stride, image[c])
+    store_pixels(pixels.planes, 3 * frame.size + p, stride, 1.0 - last)
 
 
 @formula
@@ -143,8 +158,9 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
             # behind all splats: the final T, and R of the background
-            begin_backward_row(state, BACKWARD * L * y, L, frame, pixels, v_planes, corner + y * frame.stride)
-        first, count = reached(lists, tile, pixels, corner, frame.stride)
+            p = corner + PIXEL_ROWS * y * frame.stride
+            begin_backward_row(state, BACKWARD * L * y, L, frame, pixels, v_planes, p)
+        first, count = intersections_of(lists, tile)
         # a tile without cotangent adds nothing
         if dark(v_planes, 0, 4, corner, frame.size, frame.stride):
             clear_sums(lists, first, count, SPLAT, sums)
@@ -161,9 +177,9 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
 @formula
 def begin_backward_row(state, b, L, frame, pixels, v_planes, p):
     """Start a row behind all splats: the final T, where it stopped, R of the background, v_image."""
-    last, v_pixel = load(pixels.transmittance, p), load_cotangent(v_planes, p, frame.size)
+    last, v_pixel = load_pixels(pixels.transmittance, p, frame.stride), load_cotangent(v_planes, p, frame)
     store(state, b + T * L, last)
-    store(state, b + STOP * L, load(pixels.stop, p))
+    store(state, b + STOP * L, load_pixels(pixels.stop, p, frame.stride))
     store(state, b + REST * L, last * behind_all(v_pixel, frame.background))
     store3(state, b + GRAD * L, L, v_pixel)
 

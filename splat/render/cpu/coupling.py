@@ -26,12 +26,12 @@ import numpy as np
 import torch
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import TILE_ROWS, neighbours, scratch
-from splat.backend.cpu.simd import broadcast, fetch_and_increment, iota, lanes, load, select, store, store_sums
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, TILE_ROWS, load_pixels, neighbours, scratch, store_pixels
+from splat.backend.cpu.simd import broadcast, fetch_and_increment, iota, lanes, load, store, store_sums
 from splat.losses.formulas import CENTRE, ssim_second_dot
 from splat.losses.reference import REACH, window
 from splat.render.cpu.footprints import FOOTPRINT
-from splat.render.cpu.tile import ALONG, PARAMS, alpha_terms, row_range
+from splat.render.cpu.tile import ALONG, PARAMS, alpha_terms, column_u, row_range
 
 FACTORS = 3  # f: 1, 2 r, y - c
 POWERS = 4  # fields of each factor: D, D v, D v^2, w
@@ -49,7 +49,7 @@ FIRST, SECOND = (tuple((k + 1) ** power * tap for k, tap in enumerate(TAPS)) for
 
 
 @kernel
-def coupled_blocks(counter, index, params, frame, size, footprints, image, target, seconds, blocks):
+def coupled_blocks(counter, index, params, frame, footprints, image, target, seconds, blocks):
     """Add sum M . S'' M' to the blocks (m, 9, 9) of the splats at index, largest first: threads then end at the same time.
 
     size: height and width of the image.
@@ -65,39 +65,40 @@ def coupled_blocks(counter, index, params, frame, size, footprints, image, targe
     turn = fetch_and_increment(counter)
     while turn < index.size:
         splat = index[turn]
-        y0, y1 = find_spans(params, splat, frame, size[1], footprints, corners, spans, weights)
+        y0, y1 = find_spans(params, splat, frame, footprints, corners, spans, weights)
         if y0 <= y1:
-            box = box_of_windows(spans, y0, y1, frame, size[1], L)
+            box = box_of_windows(spans, y0, y1, frame, L)
             for channel in range(3):
                 planes = (image, target, seconds, channel * frame.size)
                 work = (ring, rows, corners, spans, moved, sums)
-                sum_windows(params, splat, channel, box, frame, size, footprints, planes, work, part, total)
+                sum_windows(params, splat, channel, box, frame, footprints, planes, work, part, total)
                 add_to_block(total, channel, blocks[turn])
         turn = fetch_and_increment(counter)
 
 
 @formula
-def find_spans(params, splat, frame, width, footprints, corners, spans, weights):
+def find_spans(params, splat, frame, footprints, corners, spans, weights):
     """First and last row in which a splat has weight; fills corners and spans (see `work`).  weights: space for a vector."""
-    L = lanes(params)
+    L, across = lanes(params), lanes(params) // PIXEL_ROWS
     layout, begin, values = footprints
     first, last = layout.splat_start[splat], layout.splat_start[splat + 1]
     y0, y1, done = frame.size, np.int64(-1), np.int64(0)
     for a in range(first, last):
-        row, column = layout.tiles[a] // frame.columns * TILE_ROWS, layout.tiles[a] % frame.columns * L
+        row, column = layout.tiles[a] // frame.columns * TILE_HEIGHT, layout.tiles[a] % frame.columns * across
         corners[a - first, 0], corners[a - first, 1] = row, column
         # the rows of a new row of tiles have no columns yet
-        for y in range(max(row, done), row + TILE_ROWS):
+        for y in range(max(row, done), row + TILE_HEIGHT):
             spans[y, 0], spans[y, 1] = frame.stride, -1
-        done = row + TILE_ROWS
+        done = row + TILE_HEIGHT
         top, bottom = row_range(layout.rows[a])
-        for y in range(top, bottom):
-            store(weights, 0, load(values, (layout.place[a] - layout.place[begin] + y - top) * FOOTPRINT * L))
-            # widen the row's span by the pixels with weight
-            for x in range(min(L, width - column)):
-                if weights[x] > 0:
-                    spans[row + y, 0], spans[row + y, 1] = min(spans[row + y, 0], column + x), column + x
-                    y0, y1 = min(y0, row + y), max(y1, row + y)
+        for k in range(top, bottom):
+            store(weights, 0, load(values, (layout.place[a] - layout.place[begin] + k - top) * FOOTPRINT * L))
+            # widen the rows' spans by the pixels with weight
+            for lane in range(L):
+                x, y = column + lane % across, row + PIXEL_ROWS * k + lane // across
+                if weights[lane] > 0:
+                    spans[y, 0], spans[y, 1] = min(spans[y, 0], x), x
+                    y0, y1 = min(y0, y), max(y1, y)
     return y0, y1
 
 
@@ -111,12 +112,12 @@ def hull_of(spans, first, last):
 
 
 @formula
-def box_of_windows(spans, y0, y1, frame, width, L):
+def box_of_windows(spans, y0, y1, frame, L):
     """First and last row of a splat, first column of its windows, and the number of vectors that their columns take."""
     lo, hi = hull_of(spans, y0, y1)
     left = max(lo - REACH, 0)
-    vectors = (min(hi + REACH, width - 1) - left) // L + 1
-    return y0, y1, min(left, frame.stride - vectors * L), vectors
+    vectors = (min(hi + REACH, frame.width - 1) - left) // L + 1
+    return y0 - y0 % PIXEL_ROWS, y1, min(left, frame.stride - vectors * L), vectors
 
 
 @formula
@@ -134,7 +135,7 @@ def add_to_block(total, channel, block):
 
 
 @formula
-def sum_windows(params, splat, channel, box, frame, size, footprints, planes, work, part, total):
+def sum_windows(params, splat, channel, box, frame, footprints, planes, work, part, total):
     """Write the sum of a channel's M . S'' M' over all windows to total (PAIRS,).  box: of `box_of_windows`; part: space."""
     ring, _rows, _corners, spans, _moved, sums = work
     y0, y1, left, vectors = box
@@ -146,10 +147,11 @@ def sum_windows(params, splat, channel, box, frame, size, footprints, planes, wo
     unflushed, a = 0, footprints[0].splat_start[splat]
     for first in range(y0 - REACH, y1 + REACH + 1, TOGETHER):  # rows of windows' centres
         # the rows that come into the ring
-        for ahead in range(first + REACH, first + REACH + TOGETHER):
-            clear_row(ring, ahead, vectors, pitch, L)
+        for ahead in range(first + REACH, first + REACH + TOGETHER, PIXEL_ROWS):
+            for y in range(ahead, ahead + PIXEL_ROWS):
+                clear_row(ring, y, vectors, pitch, L)
             if y0 <= ahead <= y1:
-                a = fill_row(params, splat, channel, ahead, box, frame, size[1], footprints, a, planes, work)
+                a = fill_rows(params, splat, channel, ahead, box, frame, footprints, a, planes, work)
         # the columns that any window of these rows can see of the splat
         last = min(first + TOGETHER - 1, y1 + REACH)
         lo, hi = hull_of(spans, max(first - REACH, y0), min(last + REACH, y1))
@@ -159,7 +161,7 @@ def sum_windows(params, splat, channel, box, frame, size, footprints, planes, wo
         columns = (max(lo - REACH, 0) // L * L, min((hi + REACH) // L, vectors - 1) * L)
         # down the columns, then along each row, then into the sums
         blur_columns(work, first, lo // L * L, hi, columns, pitch, L)
-        for row in range(max(first, 0), min(last + 1, size[0])):
+        for row in range(max(first, 0), min(last + 1, frame.height)):
             at = (row - first) * FIELDS * pitch + EDGE
             add_windows(params, splat, row, left, columns, frame, planes, at, pitch, work)
         unflushed += TOGETHER
@@ -179,8 +181,8 @@ def clear_row(ring, y, vectors, pitch, L):
 
 
 @formula
-def fill_row(params, splat, channel, y, box, frame, image_width, footprints, a, planes, work):
-    """Write row y of the fields to the ring; return the splat's first accumulator in this row of tiles.
+def fill_rows(params, splat, channel, y, box, frame, footprints, a, planes, work):
+    """Write PIXEL_ROWS rows of the fields, from y on, to the ring; return the splat's first accumulator in this row of tiles.
 
     a: that of the row before, or the splat's first; accumulators are in order of their tiles' rows.
     """
@@ -188,7 +190,8 @@ def fill_row(params, splat, channel, y, box, frame, image_width, footprints, a, 
     _y0, _y1, left, vectors = box
     layout, begin, values = footprints
     L = lanes(params)
-    pitch, row = vectors * L + 2 * EDGE, y & -TILE_ROWS
+    pitch, row = vectors * L + 2 * EDGE, y & -TILE_HEIGHT
+    lo, hi = hull_of(spans, y, y + PIXEL_ROWS - 1)
     base = slot(y) * FIELDS * pitch + EDGE - left
     first, last = layout.splat_start[splat], layout.splat_start[splat + 1]
     # skip the tiles above this row
@@ -198,27 +201,26 @@ def fill_row(params, splat, channel, y, box, frame, image_width, footprints, a, 
     # the tiles of this row, as far as the splat has weight in them
     while at < last and corners[at - first, 0] == row:
         top, bottom = row_range(layout.rows[at])
-        inside, x = y - row, corners[at - first, 1]
-        if top <= inside < bottom and x <= spans[y, 1] and x + L > spans[y, 0]:
+        inside, x = (y - row) // PIXEL_ROWS, corners[at - first, 1]
+        if top <= inside < bottom and x <= hi and x + L // PIXEL_ROWS > lo:
             where = (layout.place[at] - layout.place[begin] + inside - top) * FOOTPRINT * L
-            fill_lanes(params, splat, x, y, channel, frame, image_width, where, values, planes, ring, base + x, pitch)
+            fill_lanes(params, splat, x, y, channel, frame, where, values, planes, ring, base + x, pitch)
         at += 1
     return a
 
 
 @formula
-def fill_lanes(params, splat, x, y, channel, frame, image_width, where, values, planes, ring, to, pitch):
+def fill_lanes(params, splat, x, y, channel, frame, where, values, planes, ring, to, pitch):
     """Write the fields of the vector of pixels at (x, y) to the ring at `to`; its w and D are in values at `where`."""
     L = lanes(params)
     image, target, _seconds, top = planes
     _u, terms = alpha_terms(params, splat * PARAMS, x, y)
     v = terms[0]
-    inside = iota(params) < broadcast(params, image_width - x)
-    # w and D, 0 beyond the image
-    w, D = select(inside, load(values, where), 0.0), select(inside, load(values, where + (1 + channel) * L), 0.0)
-    photo = load(target, top + y * frame.stride + x)
+    w, D = load(values, where), load(values, where + (1 + channel) * L)
+    p = top + y * frame.stride + x
+    photo = load_pixels(target, p, frame.stride)
     # the factors f: 1, 2 r, y - c
-    residual = load(image, top + y * frame.stride + x) - photo
+    residual = load_pixels(image, p, frame.stride) - photo
     put_powers(ring, to, pitch, w, D, v)
     put_powers(ring, to + POWERS * pitch, pitch, 2.0 * residual * w, 2.0 * residual * D, v)
     put_powers(ring, to + 2 * POWERS * pitch, pitch, (photo - CENTRE) * w, (photo - CENTRE) * D, v)
@@ -228,10 +230,11 @@ def fill_lanes(params, splat, x, y, channel, frame, image_width, where, values, 
 def put_powers(ring, to, pitch, w, D, v):
     """Write the POWERS fields of a factor."""
     Dv = D * v
-    store(ring, to, D)
-    store(ring, to + pitch, Dv)
-    store(ring, to + 2 * pitch, Dv * v)
-    store(ring, to + 3 * pitch, w)
+    step = FIELDS * pitch  # a row of pixels to the next one: y is even
+    store_pixels(ring, to, step, D)
+    store_pixels(ring, to + pitch, step, Dv)
+    store_pixels(ring, to + 2 * pitch, step, Dv * v)
+    store_pixels(ring, to + 3 * pitch, step, w)
 
 
 @formula
@@ -296,7 +299,7 @@ def add_windows(params, splat, row, left, columns, frame, planes, at, pitch, wor
     L = lanes(params)
     along, size = broadcast(params, params[splat * PARAMS + ALONG]), 3 * frame.size
     for x in range(columns[0], columns[1] + L, L):
-        u, _terms = alpha_terms(params, splat * PARAMS, left + x, row)
+        u = column_u(params, splat * PARAMS, left + x, iota(params))
         for factor in range(FACTORS):
             blur_row(rows, at + POWERS * factor * pitch + x, pitch, u, along, moved, SLOPES * factor * L)
         p = top + row * frame.stride + left + x

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import TILE_ROWS, scratch
-from splat.backend.cpu.simd import broadcast, iota, lanes, load, maximum, select, store
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_ROWS, load_pixels, scratch
+from splat.backend.cpu.simd import broadcast, lanes, load, maximum, select, store
 from splat.render.cpu.tile import (
     BEHIND,
     UNDO,
@@ -21,9 +21,9 @@ from splat.render.cpu.tile import (
     begin_undo_row,
     corner_of,
     intersection,
+    intersections_of,
     load3,
     next_tile,
-    reached,
     row_range,
     row_v,
     store3,
@@ -76,8 +76,8 @@ def find_footprints(counter, params, lists, frame, pixels, footprints, begin, en
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            begin_undo_row(state, UNDO * L * y, L, frame, pixels, corner + y * frame.stride)
-        first, count = reached(lists, tile, pixels, corner, frame.stride)
+            begin_undo_row(state, UNDO * L * y, L, frame, pixels, corner + PIXEL_ROWS * y * frame.stride)
+        first, count = intersections_of(lists, tile)
         for k in range(count - 1, -1, -1):
             a = lists.accumulator[first + k]
             at = np.int64(-1)
@@ -104,7 +104,7 @@ def footprint_of(params, lists, e, k, x0, y0, frame, state, found, at):
 
 
 @kernel
-def find_neighbours(counter, params, lists, frame, pixels, width, height, covered, before):
+def find_neighbours(counter, params, lists, frame, pixels, covered, before):
     """For each intersection: `covered`, how many pixels its splat has weight in; `before`, the nearest splat in front
     that shares one of these pixels, or -1."""
     L = lanes(params)
@@ -112,12 +112,11 @@ def find_neighbours(counter, params, lists, frame, pixels, width, height, covere
     tile = next_tile(counter, lists)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
-        inside = iota(params) < broadcast(params, width - x0)
         for y in range(TILE_ROWS):
-            stop = load(pixels.stop, corner + y * frame.stride)
-            store(state, 2 * L * y, select(inside, stop, -1.0) if y0 + y < height else broadcast(params, -1.0))
+            p = corner + PIXEL_ROWS * y * frame.stride
+            store(state, 2 * L * y, load_pixels(pixels.stop, p, frame.stride))
             store(state, (2 * y + 1) * L, -1.0)
-        first, count = reached(lists, tile, pixels, corner, frame.stride)
+        first, count = intersections_of(lists, tile)
         for k in range(count):
             e = first + k
             covered[e], nearest = neighbours_of(params, lists, e, k, x0, y0, frame, state, row)

@@ -1,7 +1,7 @@
 """Compositing of the splats of one view on the CPU: `render.backend.Raster` by Numba kernels on NumPy views of tensors.
 
-Planes are padded to whole tiles of `lanes` x TILE_ROWS pixels, lanes the numbers of a vector register.  An intersection is a
-splat in a tile.  Arrays of the kernels, such as `params` and the accumulators: `tile.py`.
+Planes are padded to whole tiles.  An intersection is a splat in a tile.  Tiles, and arrays of the kernels, such as `params` and
+the accumulators: `tile.py`.
 """
 
 from functools import cached_property
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from splat.backend.cpu.memory import TILE_ROWS, aligned
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range, over_tiles
 from splat.losses.cpu.loss import CpuLinearLoss
@@ -40,15 +40,17 @@ class CpuRaster:
         self.lists = self.bin(depths, drawn)
         self.intersections = self.lists.splat.size
         lanes, scalar, limits = lanes_of(self.dtype), self.dtype.type, self.thresholds
-        columns, tile_rows = -(-width // lanes), -(-height // TILE_ROWS)
-        self.plane = (tile_rows * TILE_ROWS, columns * lanes)
+        columns, tile_rows = -(-width // lanes) * PIXEL_ROWS, -(-height // TILE_HEIGHT)
+        self.plane = (tile_rows * TILE_HEIGHT, columns * lanes // PIXEL_ROWS)
         size = self.plane[0] * self.plane[1]
         self.frame = tile.Frame(
-            columns, self.plane[1], size, scalar(limits.alpha_max), scalar(limits.free), scalar(limits.floor),
-            np.ascontiguousarray(background.numpy(), self.dtype), np.repeat(np.arange(TILE_ROWS, dtype=self.dtype), lanes),
+            width, height, columns, self.plane[1], size, scalar(limits.alpha_max), scalar(limits.free), scalar(limits.floor),
+            np.ascontiguousarray(background.numpy(), self.dtype),
+            np.repeat(np.arange(0, TILE_HEIGHT, PIXEL_ROWS, dtype=self.dtype), lanes),
         )  # fmt: skip
         self.params = aligned((len(splats) * tile.PARAMS,), self.dtype)
-        self.pixels = tile.Pixels(*(aligned((planes * size,), self.dtype) for planes in (4, 1, 1)))
+        planes, last, stop = (aligned((count * size,), self.dtype) for count in (4, 1, 1))
+        self.pixels = tile.Pixels(planes, last, stop, np.empty(columns * tile_rows, np.int64))
         self.pack()
         self.forward()
 
@@ -88,14 +90,12 @@ class CpuRaster:
 
     def number_accumulators(self) -> tuple[tile.Lists, np.ndarray]:
         """The intersections that some pixel reaches, and (n + 1,) the first accumulator of each splat."""
-        stops = self._tiles(self.pixels.stop[None]).max(axis=(0, 2, 4)).reshape(-1)
-        reached = np.minimum(np.diff(self.lists.start), stops).astype(np.int64)
-        return binning.reached_lists(self.lists, reached, len(self.splats))
+        return binning.reached_lists(self.lists, self.pixels.reached, len(self.splats))
 
     def _tiles(self, planes: np.ndarray) -> np.ndarray:
-        """Planes as (planes, rows of tiles, TILE_ROWS, tiles in a row, lanes)."""
+        """Planes as (planes, rows of tiles, TILE_HEIGHT, tiles in a row, pixels in a row of a tile)."""
         columns = self.frame.columns
-        return planes.reshape(len(planes), -1, TILE_ROWS, columns, self.plane[1] // columns)
+        return planes.reshape(len(planes), -1, TILE_HEIGHT, columns, self.plane[1] // columns)
 
     @property
     def draw_order(self) -> int:
@@ -109,7 +109,7 @@ class CpuRaster:
     def pairs(self) -> int:
         packed = self.reached[0].rows  # the first and the last row of each splat in its tile, a byte each
         rows = ((packed >> 8) & 255) - (packed & 255) + 1
-        return int(rows.sum()) * self.plane[1] // self.frame.columns
+        return int(rows.sum()) * lanes_of(self.dtype)
 
     @property
     def touched(self) -> Int[Tensor, " m"]:
@@ -151,7 +151,7 @@ class CpuRaster:
         """Footprints are kept for as many splats at a time as FOOTPRINT_BYTES allow, but for one at least."""
         coupled = loss.coupling()
         (lists, splat_start), splats = self.reached, index.numpy()
-        blocks, size = np.zeros((len(splats), SPLAT, SPLAT)), (self.height, self.width)
+        blocks = np.zeros((len(splats), SPLAT, SPLAT))
         layout, row = footprints.footprints_of(lists, splat_start), footprints.FOOTPRINT * lanes_of(self.dtype)
         rows, ends = np.diff(layout.place[splat_start])[splats], layout.place[splat_start[splats + 1]]
         most = max(FOOTPRINT_BYTES // (row * self.dtype.itemsize), 1)
@@ -166,7 +166,7 @@ class CpuRaster:
             heaviest = start + np.argsort(rows[start:stop])[::-1]
             part = np.zeros((stop - start, SPLAT, SPLAT))
             over_tiles(
-                coupling.coupled_blocks, splats[heaviest], self.params, self.frame, size, (layout, begin, values),
+                coupling.coupled_blocks, splats[heaviest], self.params, self.frame, (layout, begin, values),
                 *coupled[:3], part,
             )  # fmt: skip
             blocks[heaviest] = coupled.weight * part
@@ -180,8 +180,7 @@ class CpuRaster:
         """
         lists = self.reached[0]
         covered, before = np.empty((2, lists.splat.size), np.int32)
-        size = (self.width, self.height)
-        over_tiles(footprints.find_neighbours, self.params, lists, self.frame, self.pixels, *size, covered, before)
+        over_tiles(footprints.find_neighbours, self.params, lists, self.frame, self.pixels, covered, before)
         return lists.splat, covered, before
 
     def jvp(self, directions: Float[Tensor, "n k 9"]) -> "CpuTangent":

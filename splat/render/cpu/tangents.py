@@ -9,7 +9,7 @@ those of a tangent K times.
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import TILE_ROWS, scratch
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_ROWS, load_pixels, scratch, store_pixels
 from splat.backend.cpu.simd import fma, lanes, load, prefetch, select, store
 from splat.render.cpu.compositing import begin_backward_row
 from splat.render.cpu.tile import (
@@ -32,11 +32,11 @@ from splat.render.cpu.tile import (
     corner_of,
     dark,
     intersection,
+    intersections_of,
     load3,
     load_cotangent,
     next_tile,
     no_moments,
-    reached,
     row_v,
     store3,
     store_moments,
@@ -67,10 +67,11 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
             store(state, width * y + T * L, 1.0)
-            store(state, width * y + STOP * L, load(pixels.stop, corner + y * frame.stride))
+            p = corner + PIXEL_ROWS * y * frame.stride
+            store(state, width * y + STOP * L, load_pixels(pixels.stop, p, frame.stride))
             for j in range(2, 2 + TANGENT * K):
                 store(state, width * y + j * L, 0.0)
-        first, count = reached(lists, tile, pixels, corner, frame.stride)
+        first, count = intersections_of(lists, tile)
         for k in range(count):
             later = np.int64(lists.splat[first + min(k + AHEAD, count - 1)])
             prefetch(params, later * PARAMS)
@@ -81,7 +82,7 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
             else:
                 tangent_block(params, tangents, K, lists, first + k, k, x0, y0, frame, state, shared)
         for y in range(TILE_ROWS):
-            p = corner + y * frame.stride
+            p = corner + PIXEL_ROWS * y * frame.stride
             for i in range(K):
                 end_tangent_row(state, width * y + (2 + TANGENT * i) * L, L, frame, planes, transmittances, i, p)
         tile = next_tile(counter, lists)
@@ -90,11 +91,12 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
 @formula
 def end_tangent_row(state, b, L, frame, planes, transmittances, i, p):
     """Add the background's part to a row of tangent i, and write it to the planes."""
-    dT = load(state, b + DT * L)
-    store(transmittances, i * frame.size + p, dT)
+    dT, stride = load(state, b + DT * L), frame.stride
+    store_pixels(transmittances, i * frame.size + p, stride, dT)
     dimage = plus(load3(state, b + DIMAGE * L, L), dT, frame.background)
-    store3(planes, 4 * i * frame.size + p, frame.size, dimage)
-    store(planes, (4 * i + 3) * frame.size + p, -dT)
+    for c in range(3):
+        store_pixels(planes, (4 * i + c) * frame.size + p, stride, dimage[c])
+    store_pixels(planes, (4 * i + 3) * frame.size + p, stride, -dT)
 
 
 @formula
@@ -163,12 +165,12 @@ def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, 
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            p = corner + y * frame.stride
+            p = corner + PIXEL_ROWS * y * frame.stride
             begin_backward_row(state, width * y, L, frame, pixels, v_planes, p)
             for i in range(K):
                 b = width * y + (BACKWARD + BACKWARD_TANGENT * i) * L
                 begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_planes, i, p)
-        first, count = reached(lists, tile, pixels, corner, frame.stride)
+        first, count = intersections_of(lists, tile)
         plain = dark(v_planes, 0, 4, corner, frame.size, frame.stride)
         if plain and dark(dv_planes, 0, 4 * K, corner, frame.size, frame.stride):
             clear_sums(lists, first, count, K * SPLAT, sums)
@@ -190,9 +192,10 @@ def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, 
 @formula
 def begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_planes, i, p):
     """Start tau, R' and v_image' of tangent i behind all splats, for the row of pixels at p."""
-    last, dT = load(pixels.transmittance, p), load(transmittances, i * frame.size + p)
-    v_pixel = load_cotangent(v_planes, p, frame.size)
-    dv_pixel = load_cotangent(dv_planes, 4 * i * frame.size + p, frame.size)
+    last = load_pixels(pixels.transmittance, p, frame.stride)
+    dT = load_pixels(transmittances, i * frame.size + p, frame.stride)
+    v_pixel = load_cotangent(v_planes, p, frame)
+    dv_pixel = load_cotangent(dv_planes, 4 * i * frame.size + p, frame)
     # tau = T' / T, and R = T (v_image . background + ...) differentiated
     store(state, b + TAU * L, dT / last)
     rest = dT * behind_all(v_pixel, frame.background) + last * behind_all(dv_pixel, frame.background)

@@ -1,6 +1,7 @@
 """The arrays of the compositing kernels on the CPU, and how a tile of them is read and written.
 
-A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  An intersection is a splat in a tile.  Each writes
+A vector of pixels is `lanes` / PIXEL_ROWS wide and PIXEL_ROWS high, as few splats are as wide as a register.  A tile is
+TILE_ROWS vectors, one below the other; the kernels call each a row.  An intersection is a splat in a tile.  Each writes
 its nine sums (six moments of s, three of colour: `render/formulas.py`) to an accumulator of its own, and those of a splat lie
 side by side, so that no sum depends on the order in which threads finish.  Every kernel (`compositing.py`, `tangents.py`,
 `blocks.py`) takes tiles from a counter until none is left (`threads.over_tiles`).  Arrays are flat: `params` holds PARAMS
@@ -12,20 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from splat.backend.cpu.jit import formula
-from splat.backend.cpu.memory import TILE_ROWS
-from splat.backend.cpu.simd import (
-    any_lane,
-    broadcast,
-    fetch_and_increment,
-    fma,
-    iota,
-    lanes,
-    load,
-    maximum,
-    select,
-    store,
-    store_sums,
-)
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, load_pixels, pixel_columns, pixel_rows
+from splat.backend.cpu.simd import any_lane, broadcast, fetch_and_increment, fma, load, select, store, store_sums
 from splat.render.formulas import SPLAT, along_row, alpha_row, column_terms, reciprocal, row_terms
 
 NEVER = 1e30  # the stop index of a pixel that does not stop
@@ -59,12 +48,14 @@ class Lists(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Constants of all pixels: tiles in a row, floats in a row of a plane, floats in a plane, cap, background (3,).
+    """Constants of all pixels: size of the image, tiles in a row, floats in a row of a plane, in a plane, cap, background (3,).
 
-    free, floor: as in `formulas.Thresholds`.  row_offsets: 0, ..., TILE_ROWS - 1, each `lanes` times: as vectors, they cost
-    the kernels less than a conversion.
+    free, floor: as in `formulas.Thresholds`.  row_offsets: the first row of pixels of each vector of a tile, `lanes` times: as
+    vectors, they cost the kernels less than a conversion.
     """
 
+    width: int
+    height: int
     columns: int
     stride: int
     size: int
@@ -76,11 +67,15 @@ class Frame(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """Results of `forward` in each pixel: planes (red, green, blue, alpha), the final T, and where it stopped."""
+    """Results of `forward` in each pixel: planes (red, green, blue, alpha), the final T, and where it stopped.
+
+    Pixels beyond the image stop in front of all splats.  reached: (tiles,) how many intersections some pixel reaches.
+    """
 
     planes: np.ndarray
     transmittance: np.ndarray
     stop: np.ndarray
+    reached: np.ndarray
 
 
 @formula
@@ -93,7 +88,7 @@ def next_tile(counter, lists):
 @formula
 def corner_of(tile, lanes, columns, stride):
     """Column and row of a tile's first pixel, and its index in a plane."""
-    x0, y0 = (tile % columns) * lanes, (tile // columns) * TILE_ROWS
+    x0, y0 = (tile % columns) * (lanes // PIXEL_ROWS), (tile // columns) * TILE_HEIGHT
     return x0, y0, y0 * stride + x0
 
 
@@ -104,20 +99,29 @@ def row_range(packed):
 
 
 @formula
+def column_u(params, o, x0, columns):
+    """u of columns, counted from x0; the mean is in double precision, as in `alpha_terms`."""
+    dx = x0 - np.float64(params[o + MX]) - params[o + MX_REST]
+    return fma(columns, params[o + ALONG], params[o + ALONG] * dx)
+
+
+@formula
 def alpha_terms(params, o, x0, y0):
     """u of a tile's columns, and what gives v and log2 alpha of its rows: v of row 0, its step, log2 o - u^2, cut.
 
     The offset of the tile's corner is in double precision: far from the mean, v of a needle is a small difference.
     """
     # whitened offset of a pixel (dx, dy): u = along dx, v = across (shear dx + dy)
-    along, across = params[o + ALONG], params[o + ACROSS]
+    across = params[o + ACROSS]
     shear = np.float64(params[o + SHEAR]) + params[o + SHEAR_REST]
     # from the mean to the tile's corner; the rest of each rounded number is added
     dx = x0 - np.float64(params[o + MX]) - params[o + MX_REST]
     dy = y0 - np.float64(params[o + MY]) - params[o + MY_REST]
-    # the columns are 0, 1, ... pixels from the corner; a row adds `across` to v
-    u = fma(iota(params), along, along * dx)
-    v = fma(iota(params), across * shear, across * (shear * dx + dy))
+    # the columns are 0, 1, ... pixels from the corner; a row of pixels adds `across` to v
+    columns = pixel_columns(params)
+    u = column_u(params, o, x0, columns)
+    v = fma(columns, across * shear, across * (shear * dx + dy))
+    v = fma(pixel_rows(params), across, v)
     terms = (v, broadcast(params, across), fma(-u, u, params[o + LO]), broadcast(params, params[o + CUT]))
     return u, terms
 
@@ -144,9 +148,9 @@ def row_v(frame, L, y, terms):
 @formula
 def begin_undo_row(state, b, L, frame, pixels, p):
     """Start a row behind all splats: T, STOP, and the background's colour times T."""
-    last = load(pixels.transmittance, p)
+    last = load_pixels(pixels.transmittance, p, frame.stride)
     store(state, b + T * L, last)
-    store(state, b + STOP * L, load(pixels.stop, p))
+    store(state, b + STOP * L, load_pixels(pixels.stop, p, frame.stride))
     for c in range(3):
         store(state, b + (BEHIND + c) * L, last * frame.background[c])
 
@@ -190,21 +194,28 @@ def store3(array, i, step, values):
 
 
 @formula
-def load_cotangent(planes, p, size):
-    """v_image and v_alpha of a row."""
-    return load(planes, p), load(planes, p + size), load(planes, p + 2 * size), load(planes, p + 3 * size)
+def load_planes(planes, p, frame):
+    """The row of pixels at p of three planes."""
+    size, stride = frame.size, frame.stride
+    return (
+        load_pixels(planes, p, stride),
+        load_pixels(planes, p + size, stride),
+        load_pixels(planes, p + 2 * size, stride),
+    )
 
 
 @formula
-def reached(lists, tile, pixels, corner, stride):
-    """The first intersection of a tile, and how many of its intersections some pixel reaches before it stops."""
-    furthest = load(pixels.stop, corner)
-    for y in range(1, TILE_ROWS):
-        furthest = maximum(furthest, load(pixels.stop, corner + y * stride))
-    row = np.empty(lanes(pixels.stop), pixels.stop.dtype)
-    store(row, 0, furthest)
+def load_cotangent(planes, p, frame):
+    """v_image and v_alpha of a row."""
+    red, green, blue = load_planes(planes, p, frame)
+    return red, green, blue, load_pixels(planes, p + 3 * frame.size, frame.stride)
+
+
+@formula
+def intersections_of(lists, tile):
+    """The first intersection of a tile, and how many it has."""
     first = np.int64(lists.start[tile])
-    return first, np.int64(min(lists.start[tile + 1] - first, row.max()))
+    return first, lists.start[tile + 1] - first
 
 
 @formula
@@ -212,8 +223,8 @@ def dark(planes, first_plane, count, corner, size, stride):
     """Whether `count` planes are exactly 0 all over a tile: a cotangent that leaves nothing to do."""
     lit, one = broadcast(planes, 0.0), broadcast(planes, 1.0)
     for plane in range(first_plane, first_plane + count):
-        for y in range(TILE_ROWS):
-            value = load(planes, plane * size + corner + y * stride)
+        for y in range(0, TILE_HEIGHT, PIXEL_ROWS):
+            value = load_pixels(planes, plane * size + corner + y * stride, stride)
             lit = select((value >= 0.0) & (value <= 0.0), lit, one)  # NaN is neither
     return not any_lane(lit > 0.0)
 

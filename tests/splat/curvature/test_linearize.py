@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.linearize import LinearizedView
@@ -260,10 +261,10 @@ def test_tiles_are_dark_where_the_picture_is_met_exactly_and_the_loss_does_not_c
     gaussians, view = random_gaussians(40, 1, logit=1.0), two_views(45, 37)[0]
     # behind the others one that fills the picture: no tile is empty, however many pixels wide the machine's registers are
     gaussians.means[0], gaussians.log_scales[0] = torch.tensor([0.0, 0.0, 9.0], dtype=torch.float64), 3.0
-    met = hold(gaussians, view, LossSettings()).image[:, :16]  # a row of tiles
-    view = replace(view, image=torch.cat([met, view.image[:, 16:].double()], dim=1))
+    met = hold(gaussians, view, LossSettings()).image[:, :TILE_HEIGHT]  # a row of tiles
+    view = replace(view, image=torch.cat([met, view.image[:, TILE_HEIGHT:].double()], dim=1))
     alone, coupled = (hold(gaussians, view, LossSettings(ssim_weight=weight)) for weight in (0.0, 0.2))
-    first_row = -(-45 // lanes_of(np.float64))
+    first_row = -(-45 // lanes_of(np.float64)) * PIXEL_ROWS
     lists = alone._raster.lists  # pyright: ignore[reportAttributeAccessIssue]
     assert (np.diff(lists.start)[:first_row] > 0).all()
     assert alone.dark_tiles == first_row and coupled.dark_tiles == 0

@@ -13,7 +13,16 @@ import pytest
 from splat.backend.cpu import kernel_cache, simd
 from splat.backend.cpu.dual import exp
 from splat.backend.cpu.exponential import EXP2_ERROR, exp2, log
-from splat.backend.cpu.memory import gather, neighbours, scatter
+from splat.backend.cpu.memory import (
+    PIXEL_ROWS,
+    gather,
+    load_pixels,
+    neighbours,
+    pixel_columns,
+    pixel_rows,
+    scatter,
+    store_pixels,
+)
 from splat.backend.cpu.simd import (
     any_lane,
     broadcast,
@@ -195,6 +204,26 @@ def test_neighbours_are_those_to_the_right_then_those_to_the_left(dtype):
     a, out, at = np.arange(16 * L, dtype=dtype), np.empty(10 * L, dtype), 8 * L
     all_around(a, at, out)
     assert (out.reshape(10, L) == at + np.arange(L) + np.array([[1, 2, 3, 4, 5, -1, -2, -3, -4, -5]]).T).all()
+
+
+@numba.njit
+def through_pixels(plane, at, stride, out, places):
+    store_pixels(out, at, stride, load_pixels(plane, at, stride))
+    store(places, 0, pixel_columns(plane))
+    store(places, lanes(plane), pixel_rows(plane))
+
+
+@each_dtype
+def test_vectors_of_pixels_are_read_and_written_row_by_row(dtype):
+    L, stride, at = lanes_of(dtype), 2 * lanes_of(dtype), 2 * lanes_of(dtype) + 1
+    plane = np.arange(1, 4 * stride + 1, dtype=dtype)
+    out, places = np.zeros_like(plane), np.empty(2 * L, dtype)
+    through_pixels(plane, at, stride, out, places)
+    columns, rows = places.reshape(2, L).astype(int)
+    expected = np.zeros_like(plane)
+    expected[at + columns + stride * rows] = plane[at + columns + stride * rows]
+    assert (out == expected).all() and np.count_nonzero(out) == L
+    assert (columns + L // PIXEL_ROWS * rows).tolist() == list(range(L))
 
 
 @each_dtype

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splat.backend.cpu.memory import TILE_ROWS
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, TILE_ROWS
 from splat.backend.cpu.simd import lanes_of
 from splat.model.settings import RenderSettings
 from splat.render.cpu.binning import bin_splats, depth_order, heaviest_first, radix_argsort
@@ -62,7 +62,8 @@ def test_tile_lists_hold_every_active_row_and_hardly_any_other(name, dtype):
     n, (width, height) = expected.case.n, expected.case.size
     padded = np.zeros((n, *raster.plane), bool)
     padded[:, :height, :width] = active_pixels(name)
-    rows_of_tiles = padded.reshape(n, raster.plane[0], columns, L).any(axis=3)  # (n, padded height, columns)
+    # (n, vectors of pixels down the image, columns)
+    rows_of_tiles = padded.reshape(n, -1, PIXEL_ROWS, columns, L // PIXEL_ROWS).any(axis=(2, 4))
     listed = np.zeros_like(rows_of_tiles)
     depths = expected.depths.numpy()
     for tile in range(lists.start.size - 1):
@@ -86,7 +87,11 @@ def test_tiles_are_handed_out_once_each():
 def test_entries_that_no_pixel_reaches_are_dropped_and_the_others_numbered_splat_by_splat():
     raster = truth("walled").raster(DTYPES[0])
     before, columns = raster.lists, raster.frame.columns
-    stops = raster.pixels.stop.reshape(-1, TILE_ROWS, columns, lanes_of(np.float32)).max(axis=(1, 3)).reshape(-1)
+    stops = (
+        raster.pixels.stop.reshape(-1, TILE_HEIGHT, columns, lanes_of(np.float32) // PIXEL_ROWS)
+        .max(axis=(1, 3))
+        .reshape(-1)
+    )
     after, start = raster.reached
     assert after.splat.size < before.splat.size
     for tile, stop in enumerate(stops):

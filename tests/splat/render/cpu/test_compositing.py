@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splat.backend.cpu.memory import TILE_ROWS
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT
 from splat.backend.cpu.simd import lanes_of
 from splat.model.settings import RenderSettings
 from splat.render.backend import plain_gradient
@@ -156,7 +156,7 @@ def test_tiles_with_a_cotangent_of_zero_are_left_out_and_add_nothing(monkeypatch
     raster = expected.raster(torch.float64)
     tangent = plain_jvp(raster, expected.U[:, :K])
     lit = torch.zeros(raster.height, raster.width, dtype=torch.float64)
-    lit[:TILE_ROWS, :] = 1  # the first row of tiles
+    lit[:TILE_HEIGHT, :] = 1  # the first row of tiles
     lit[-1, -1] = 1  # and one pixel of the last
     curvature = torch.rand(3, *raster.plane, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     index = torch.arange(len(expected.splats))
@@ -179,7 +179,7 @@ def test_a_cotangent_that_is_not_a_number_is_not_taken_for_zero():
 
 @pytest.mark.parametrize("shift", [0.0, 2.0])
 def test_a_splat_that_passes_to_the_next_tile_changes_the_draw_order(shift):
-    tile = lanes_of(np.float64)
+    tile = lanes_of(np.float64) // PIXEL_ROWS
     splats = torch.tensor([[tile / 2, 8.0, 9.0, 0.0, 9.0, 0.9, 1, 1, 1]] * 3, dtype=torch.float64)
     splats[:, 0] = torch.tensor([tile / 2, tile - 1.0, tile * 1.5])
     depths, drawn = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.ones(3, dtype=torch.bool)
@@ -187,7 +187,7 @@ def test_a_splat_that_passes_to_the_next_tile_changes_the_draw_order(shift):
     moved[1, 0] += shift  # from the end of one tile's list to the start of the next one's
 
     def raster(splats: Tensor) -> CpuRaster:
-        return CpuRaster(splats, depths, drawn, torch.zeros(3), 2 * tile, TILE_ROWS, RenderSettings())
+        return CpuRaster(splats, depths, drawn, torch.zeros(3), 2 * tile, TILE_HEIGHT, RenderSettings())
 
     one, other = raster(splats), raster(moved)
     assert one.lists.splat.tolist() == other.lists.splat.tolist() == [0, 1, 2]
