@@ -32,10 +32,8 @@ START = "start"
 ROOM = 0.05  # of the range of sections, beyond it
 INNER = 0.65  # of the reach of a surface: no tick farther out
 ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
-SLICES = (
-    ("slice-eigenvectors-2d", SliceRecord),
-    ("probe", ProbeRecord),
-)  # beside a checkpoint, the first that is there
+# beside a checkpoint, the first that is there
+SLICES = (("slice-eigenvectors-2d", SliceRecord), ("probe", ProbeRecord))
 LEVELS, POINTS = 10, 61  # of a contour plot; of a window, each way
 NAMES = ("e₁", "e₂")
 FUNCTION = {"views": "training views", "sizes": "sizes of the views", "loss": "loss", "background": "background"}

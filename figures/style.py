@@ -32,15 +32,8 @@ PAPER_FONTS = ["STIXGeneral", "DejaVu Sans"]  # the second for what the first la
 FIELD_MAP = "cividis"
 MISSING = "0.85"  # grey of points without a value
 
-BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (
-    "#000000",
-    "#E69F00",
-    "#56B4E9",
-    "#009E73",
-    "#0072B2",
-    "#D55E00",
-    "#CC79A7",
-)
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+BLUE, VERMILION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 SIDES: tuple[Literal["left", "center", "right"], ...] = ("left", "center", "right")  # of a title
 RUNS = (VERMILION, GREEN, BLUE, ORANGE, PURPLE, SKY, BLACK)  # a run has the same colour in every figure
 POSITIVE, NEGATIVE, UNDETERMINED = BLUE, VERMILION, "0.45"
@@ -120,9 +113,8 @@ def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:
         caption = for_paper(figure)
         write_atomically(path.with_suffix(".txt"), f"{caption}\n".encode())
     with style(), replacing(path) as partial:
-        if (
-            path.suffix == ".png"
-        ):  # savefig draws twice, once for the layout alone, and keeps that nothing shines through
+        # savefig draws twice, once for the layout alone, and keeps that nothing shines through
+        if path.suffix == ".png":
             canvas = FigureCanvasAgg(figure)
             canvas.draw()
             picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])

@@ -3,9 +3,8 @@
 from rich import control
 from rich.console import Console
 
-OBEYED = dict.fromkeys(
-    [*range(9), *range(11, 32), *range(127, 160)], "\N{REPLACEMENT CHARACTER}"
-)  # by a terminal, of a text
+# by a terminal, of a text
+OBEYED = dict.fromkeys([*range(9), *range(11, 32), *range(127, 160)], "\N{REPLACEMENT CHARACTER}")
 control._CONTROL_STRIP_TRANSLATE |= OBEYED  # of all that rich prints, which takes a few of them away by itself
 
 

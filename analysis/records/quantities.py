@@ -51,9 +51,8 @@ def quantity(value: float | None, error: float | None = None) -> str:
     places = min(1 - _exponent(error, 2), DIGITS - 1 - exponent)
     if Decimal(error).scaleb(places) < Decimal("0.5"):
         return _plain(value)
-    exponent = _exponent(
-        float(round(Decimal(max(abs(value), error)), places))
-    )  # to these places it may have a digit more
+    # to these places it may have a digit more
+    exponent = _exponent(float(round(Decimal(max(abs(value), error)), places)))
     if -3 <= exponent <= 3:
         return f"{_fixed(value, 0, places)}{PLUS_MINUS}{_fixed(error, 0, places)}"
     places += exponent

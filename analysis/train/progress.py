@@ -34,10 +34,8 @@ from splat.training.state import Training
 
 LOG, TRACKED = "train.csv", "tracked"
 COLUMNS = ("step", "loss", "psnr", "gaussians", "seconds", "cpu")
-EARLY, FAST = (
-    0.1,
-    3,
-)  # a run whose Gaussians become more than so many times those of its start in this share of it says why
+# a run whose Gaussians become more than FAST times those of its start in this share of it says why
+EARLY, FAST = 0.1, 3
 SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
 
 

@@ -64,9 +64,8 @@ def _better_method(run: Hutchinson, estimate: TraceEstimate) -> Literal["xtrace"
     goal = max(settings.rtol * abs(estimate.value), settings.atol)
     needed = min(probes * (estimate.half_width / goal) ** 2 if goal > 0 else inf, settings.max_probes)
     if run.kept and 2 * probes <= needed and error > 0:
-        outside = outside_sketch(
-            joined(run.kept)[1] / error
-        )  # in units of the error: squares stay in the range of floats
+        # in units of the error: squares stay in the range of floats
+        outside = outside_sketch(joined(run.kept)[1] / error)
         if WORSE * outside < probes / 2:  # p_2 = k error^2 / 2
             return "xtrace"
     return "exact" if probes + run.operator.dim <= needed else None

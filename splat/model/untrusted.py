@@ -321,9 +321,8 @@ class Taken(InputError):
 def inside(folder: Path, name: str) -> Path:
     """The file of this name in a folder.  InputError where a name of someone else's file leads out of it."""
     path = folder / name
-    by_name = Path(os.path.abspath(path)).is_relative_to(
-        os.path.abspath(folder)
-    )  # links in it may lead where they will
+    # links in it may lead where they will
+    by_name = Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder))
     if not by_name and not path.resolve().is_relative_to(folder.resolve()):
         raise InputError(
             f"expected names of files in {folder}, got {name!r}, which leads out of it; move the file there"

@@ -274,9 +274,8 @@ def _at_size(layers: Float[Tensor, "c h w"], size: tuple[int, int], path: Path) 
     """A mask or depth map at the size of its photograph, whose shape it must have."""
     height, width = layers.shape[1:]
     made = (width, height)
-    if not (
-        _same_shape(made, size) or _same_shape(size, made)
-    ):  # the rounding is of the one that was made of the other
+    # the rounding is of the one that was made of the other
+    if not (_same_shape(made, size) or _same_shape(size, made)):
         raise InputError(
             f"expected {path} to have the shape of its photograph, {size[0]} x {size[1]} px at any scale, got "
             f"{width} x {height}; make it from that photograph"

@@ -116,9 +116,8 @@ def gaussians_from_points(
 
 def _merged(xyz: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """The points that differ in float32, sorted, and the mean colours there."""
-    order = np.lexsort(
-        [*rgb.T.numpy(), *xyz.T.numpy()]
-    )  # in which colours are summed, and one of them stands for a place
+    # in which colours are summed, and one of them stands for a place
+    order = np.lexsort([*rgb.T.numpy(), *xyz.T.numpy()])
     rounded = xyz[order].float().numpy() + 0.0  # no -0
     _, first, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
     index = torch.from_numpy(place.ravel())

@@ -135,9 +135,8 @@ class Viewer:
         own, first = cameras[start], self.server.initial_camera
         first.position, first.up = tuple(places[start].tolist()), tuple((-own.rotation[1]).tolist())
         depth = float(((self.objective.active.means.double() - own.centre) @ own.forward).median())
-        first.look_at = tuple(
-            self.frame.place(own.centre + max(depth, 0.0) * own.forward).tolist()
-        )  # which it turns about
+        # which it turns about
+        first.look_at = tuple(self.frame.place(own.centre + max(depth, 0.0) * own.forward).tolist())
         first.fov = 2 * float(np.arctan(own.height / 2 / own.fy))
 
     def add_fields(self, fields: Fields, shown: str) -> None:

@@ -34,13 +34,8 @@ from splat.model.harmonics import Y00
 
 FEATURES = 256
 PARTS = {"displacement": 3, "scale": 1, "turn": 3, "thickness": 1, "colour": 3}
-SIZES = {
-    "displacement": 0.03,
-    "scale": 0.04,
-    "turn": 0.01,
-    "thickness": 0.1,
-    "colour": 0.01,
-}  # alike rises of the loss on fern
+# alike rises of the loss on fern
+SIZES = {"displacement": 0.03, "scale": 0.04, "turn": 0.01, "thickness": 0.1, "colour": 0.01}
 
 
 class Sharpness(NamedTuple):

@@ -146,9 +146,8 @@ class SecondOrderMethod(Method[S], Generic[S]):
         loss = replace(config.loss, pixel="charbonnier") if config.loss.pixel == "l1" else config.loss
         local = LocalModel(SceneObjective(step.gaussians, views, loss, step.background, config.render), self.settings)
         moved = self._descend(local, step.number)
-        vars(local.objective).pop(
-            "linearized", None
-        )  # a reference cycle, which would keep its memory until Python looks for cycles
+        # a reference cycle, which would keep its memory until Python looks for cycles
+        vars(local.objective).pop("linearized", None)
         if moved is not None:
             after = step.gaussians.with_flat(step.gaussians.flat.clone())
             for name, values in after.attributes.items():
