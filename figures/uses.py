@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from analysis.commands.uses.options import GEOMETRY, TWICE
+from analysis.commands.options import GEOMETRY, TWICE
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from figures.scripts import folder_script

@@ -23,8 +23,16 @@ import tyro
 from rich.console import Console
 
 from analysis.bench.options import BenchOptions
-from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions, ViewOptions
-from analysis.commands.uses.options import NextViewOptions, PruneOptions, UncertaintyOptions
+from analysis.commands.options import (
+    ConvertOptions,
+    DemoOptions,
+    MapOptions,
+    NextViewOptions,
+    PruneOptions,
+    SfmOptions,
+    UncertaintyOptions,
+    ViewOptions,
+)
 from analysis.console.failures import report
 from analysis.console.interruption import interruption, loading
 from analysis.console.options import registry
@@ -56,8 +64,8 @@ SENTENCES = {  # what the parser says in a box, in which words
 
 @dataclass(frozen=True)
 class Command:
-    """A subcommand.  options: what is parsed; runs: MODULE:FUNCTION, imported when it runs, called with the options; example:
-    words after its name that are shown in its help.
+    """A subcommand.  options: what is parsed; runs: MODULE:FUNCTION, of `analysis`, imported when it runs, called with the
+    options; example: words after its name that are shown in its help.
 
     recorded: the function is also given the command as typed; draws: and a `Draw` of this module of figures, whose process
     starts at once; compiles, or recorded: it says so when kernels are compiled.
@@ -73,42 +81,34 @@ class Command:
 
 GROUPS = {  # as a person works
     "make": {
-        "sfm": Command(SfmOptions, "analysis.commands.sfm:run_sfm", "PHOTOS"),
-        "train": Command(
-            TrainOptions, "analysis.train.command:run_training", "SCENE --views 3 --out runs/fern", recorded=True
-        ),
-        "sweep": Command(SweepOptions, "analysis.runs.sweep.sweep:run_sweep", "notebooks/study_small.toml"),
-        "demo": Command(DemoOptions, "analysis.commands.demo:run_demo", "", compiles=True),
+        "sfm": Command(SfmOptions, "commands.sfm:run_sfm", "PHOTOS"),
+        "train": Command(TrainOptions, "train.command:run_training", "SCENE --views 3 --out runs/fern", recorded=True),
+        "sweep": Command(SweepOptions, "runs.sweep.sweep:run_sweep", "notebooks/study_small.toml"),
+        "demo": Command(DemoOptions, "commands.demo:run_demo", "", compiles=True),
     },
     "measure": {
         "probe": Command(
-            ProbeOptions, "analysis.commands.uses.renderer:run_any_probe", "runs/fern", recorded=True, draws="make_all"
+            ProbeOptions, "commands.uses.renderer:run_any_probe", "runs/fern", recorded=True, draws="make_all"
         ),
-        "slice": Command(SliceOptions, "analysis.slice.command:run_slice", "runs/fern --along gradient", recorded=True),
-        "compare": Command(CompareOptions, "analysis.runs.compare:run_compare", "runs/fern runs/fern-stable"),
-        "trajectory": Command(
-            TrajectoryOptions, "analysis.runs.trajectories:run_trajectory", "runs/fern runs/fern-stable"
-        ),
-        "bench": Command(BenchOptions, "analysis.bench.command:run_bench", "runs/fern"),
+        "slice": Command(SliceOptions, "slice.command:run_slice", "runs/fern --along gradient", recorded=True),
+        "compare": Command(CompareOptions, "runs.compare:run_compare", "runs/fern runs/fern-stable"),
+        "trajectory": Command(TrajectoryOptions, "runs.trajectories:run_trajectory", "runs/fern runs/fern-stable"),
+        "bench": Command(BenchOptions, "bench.command:run_bench", "runs/fern"),
     },
     "see": {
-        "map": Command(MapOptions, "analysis.commands.map.command:run_map", "runs/fern", recorded=True, draws="maps"),
-        "view": Command(ViewOptions, "analysis.commands.view.command:run_view", "runs/fern", compiles=True),
+        "map": Command(MapOptions, "commands.map.command:run_map", "runs/fern", recorded=True, draws="maps"),
+        "view": Command(ViewOptions, "commands.view.command:run_view", "runs/fern", compiles=True),
     },
     "use": {
-        "prune": Command(PruneOptions, "analysis.commands.uses.prune:run_prune", "runs/fern --keep 0.5", recorded=True),
-        "next-view": Command(
-            NextViewOptions, "analysis.commands.uses.next_view:run_next_view", "runs/fern", recorded=True
-        ),
+        "prune": Command(PruneOptions, "commands.uses.prune:run_prune", "runs/fern --keep 0.5", recorded=True),
+        "next-view": Command(NextViewOptions, "commands.uses.next_view:run_next_view", "runs/fern", recorded=True),
         "uncertainty": Command(
-            UncertaintyOptions, "analysis.commands.uses.uncertainty:run_uncertainty", "runs/fern", recorded=True
+            UncertaintyOptions, "commands.uses.uncertainty:run_uncertainty", "runs/fern", recorded=True
         ),
     },
     "exchange": {
         "convert": Command(
-            ConvertOptions,
-            "analysis.commands.convert:run_convert",
-            "point_cloud.ply runs/theirs/checkpoint.pt --scene SCENE",
+            ConvertOptions, "commands.convert:run_convert", "point_cloud.ply runs/theirs/checkpoint.pt --scene SCENE"
         )
     },
 }
@@ -121,14 +121,8 @@ def overview() -> str:
     for title, group in GROUPS.items():
         lines += ["", title]
         lines += [f"  {name:12} {inspect.getdoc(each.options).splitlines()[0]}" for name, each in group.items()]  # pyright: ignore[reportOptionalMemberAccess]
-    return "\n".join(
-        [
-            *lines,
-            "",
-            "landscape COMMAND --help has its options and an example, landscape --version the version;",
-            f"{DEBUG} shows where in the program an error came up.",
-        ]
-    )
+    lines += ["", "landscape COMMAND --help has its options and an example, landscape --version the version;"]
+    return "\n".join([*lines, f"{DEBUG} shows where in the program an error came up."])
 
 
 def command() -> NoReturn:
@@ -270,7 +264,7 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
 
             given.append(around.enter_context(drawing(command.draws)))
         with loading():
-            module = import_module(name)
+            module = import_module(f"analysis.{name}")
         if command.recorded:
             around.enter_context(interruption())
         return getattr(module, function)(*given)

@@ -4,6 +4,7 @@ Each command's options are a plain dataclass beside the command, in an `options.
 The help keeps the line breaks of their docstrings: a line is a sentence.
 """
 
+from collections.abc import Sequence
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,11 +12,18 @@ from typing import Annotated, Any, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, Suppress, arg
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
+from landscape.errors import InputError, did_you_mean
 from splat.training.origin.options import Foreign, Trainer
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 Device = Annotated[DeviceName, arg(metavar="NAME", help="cpu, cuda; auto: a GPU that can be used, else the CPU.")]
 QUIET = "quiet"  # a mark of dataclasses that `registry` has read
+
+
+def require_known(option: str, given: str, known: Sequence[str]) -> None:
+    """InputError unless an option has one of the known values."""
+    if given not in known:
+        raise InputError(f"expected --{option} {', '.join(known)}, got {given!r}{did_you_mean(given, known)}")
 
 
 def registry(*, foreign: bool = True) -> ConstructorRegistry:

@@ -16,7 +16,7 @@ from analysis.console.failures import program as run_program
 
 ROOT = Path(__file__).parents[2]
 LATE = ("matplotlib.figure", "pandas", "scipy.sparse.csgraph", "torch.fx.experimental.symbolic_shapes")
-for _name in (*LATE, *(each.runs.split(":")[0] for each in cli.COMMANDS.values())):
+for _name in (*LATE, *(f"analysis.{each.runs.split(':')[0]}" for each in cli.COMMANDS.values())):
     import_module(_name)
 
 

@@ -23,11 +23,12 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from analysis.commands.map.fields import ENDS, PROBE, Fields, in_words, measured_fields, require_known_field
+from analysis.commands.map.fields import ENDS, PROBE, Fields, in_words, measured_fields
 from analysis.commands.map.files import coloured_ply, fields_ply, top_table
 from analysis.commands.map.pictures import error_shade, view_maps, write_maps
 from analysis.commands.options import MapOptions
 from analysis.console.drawing import Draw
+from analysis.console.options import require_known
 from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.measures.fragility import fragility, fragility_sentences
@@ -53,7 +54,7 @@ AXES = ("order_gap", "condition", "one_view")  # of fragility
 def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
     """Map the checkpoint; returns the exit code.  command: as typed, for the record; drawn: draws the pictures."""
     out, probe = options.out or options.checkpoint.parent / MAP, options.checkpoint.parent / PROBE
-    require_known_field(options.shown, [*FIELDS, *ENDS])
+    require_known("field", options.shown, (*FIELDS, *ENDS))
     start, notes = perf_counter(), list[str]()
     require_replaceable(out, MapRecord.FILE)
     stages = Stages(Console(stderr=True))

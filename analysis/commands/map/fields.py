@@ -12,7 +12,6 @@ from analysis.measures.localization import masses
 from analysis.measures.steepest import End
 from analysis.records.quantities import Shade, percent, quantity
 from analysis.records.records import recorded_probe
-from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
 from splat.curvature.fields import FIELDS, Field, Values, scene_fields
 from splat.curvature.objective import SceneObjective
@@ -51,12 +50,6 @@ def in_words(kind: Field, value: float) -> str:
     """
     whole = f"{value:,.0f}" if value.is_integer() else quantity(value)
     return f"{percent(value) if kind.words.startswith('share') else whole} {kind.unit}".rstrip()
-
-
-def require_known_field(name: str, known: Sequence[str]) -> None:
-    """InputError unless --field names one of these."""
-    if name not in known:
-        raise InputError(f"expected --field {', '.join(known)}, got {name!r}{did_you_mean(name, known)}")
 
 
 def measured_fields(

@@ -22,15 +22,16 @@ import torch
 from rich.console import Console
 
 from analysis.bench.tables import rich_table
-from analysis.commands.uses.options import GEOMETRY, TWICE, NextViewOptions
+from analysis.commands.options import GEOMETRY, TWICE, NextViewOptions
 from analysis.console.drawing import draw
+from analysis.console.options import require_known
 from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance_of
 from analysis.records.quantities import quantity
 from analysis.records.records import record_folder, require_replaceable
-from landscape.errors import InputError, did_you_mean
+from landscape.errors import InputError
 from splat.curvature.scores.information import GAINS, Information, gains, gains_of_each, informations, prior_of
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import open_subject
@@ -42,8 +43,7 @@ RECORD = "next-view.json"  # the file by which a folder of results is known
 
 def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
     """Judge the candidates; returns the exit code.  command: as typed, for the record."""
-    if options.by not in GAINS:
-        raise InputError(f"expected --by {', '.join(GAINS)}, got {options.by!r}{did_you_mean(options.by, GAINS)}")
+    require_known("by", options.by, GAINS)
     out = options.out or options.checkpoint.parent / "next-view"
     require_replaceable(out, RECORD)
     stages = Stages(Console(stderr=True))

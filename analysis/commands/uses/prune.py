@@ -27,16 +27,17 @@ from torch import Tensor
 
 from analysis.bench.tables import rich_table
 from analysis.commands.convert import own_file
-from analysis.commands.uses.options import PruneOptions
+from analysis.commands.options import PruneOptions
 from analysis.console.drawing import draw
 from analysis.console.kept import Kept
+from analysis.console.options import require_known
 from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance_of
 from analysis.records.quantities import quantity
 from analysis.records.records import record_folder, require_replaceable
-from landscape.errors import InputError, did_you_mean
+from landscape.errors import InputError
 from landscape.results import Progress, t_quantile
 from splat.curvature.objective import SceneObjective
 from splat.curvature.scores.removal import EXACT, SCORES, removal_errors, removal_scores
@@ -107,10 +108,7 @@ def _require_sensible(options: PruneOptions) -> None:
         raise InputError(f"expected --keep as a share above 0 and up to 1, got {options.keep:g}{hint}")
     if options.sample < 3:
         raise InputError(f"expected --sample of at least 3, got {options.sample}")
-    if options.score not in SCORES:
-        raise InputError(
-            f"expected --score {', '.join(SCORES)}, got {options.score!r}{did_you_mean(options.score, SCORES)}"
-        )
+    require_known("score", options.score, SCORES)
 
 
 def pruned(training: Training, objective: SceneObjective, score: Float64[Tensor, " n"], keep: float) -> Training:

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from rich.console import Console
 
-from analysis.commands.uses.options import UncertaintyOptions
+from analysis.commands.options import UncertaintyOptions
 from analysis.console.drawing import draw
 from analysis.console.plain import say
 from analysis.console.stages import Stages

@@ -9,10 +9,11 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from analysis.commands.map.fields import ENDS, PROBE, measured_fields, require_known_field
+from analysis.commands.map.fields import ENDS, PROBE, measured_fields
 from analysis.commands.options import ViewOptions
 from analysis.commands.view.page import offline_page
 from analysis.commands.view.viewer import APPEARANCE, Viewer
+from analysis.console.options import require_known
 from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.measures.steepest import heaviest_view
@@ -31,7 +32,7 @@ STEEPEST = "e₁"
 def run_view(options: ViewOptions) -> int:
     """Show the checkpoint until Ctrl-C, or write a page; returns the exit code."""
     viser = import_module("viser")
-    require_known_field(options.shown, (APPEARANCE, *FIELDS, *ENDS))
+    require_known("field", options.shown, (APPEARANCE, *FIELDS, *ENDS))
     console, folder = Console(stderr=True), options.checkpoint.parent
     stages = Stages(console)
     with stages.stage("load"):

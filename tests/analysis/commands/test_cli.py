@@ -417,7 +417,7 @@ def test_every_command_has_a_function_that_takes_what_it_is_given(name):
     command = COMMANDS[name]
     module, function = command.runs.split(":")
     given = [object()] * (1 + command.recorded + (command.draws is not None))
-    signature = inspect.signature(getattr(importlib.import_module(module), function))
+    signature = inspect.signature(getattr(importlib.import_module(f"analysis.{module}"), function))
     signature.bind(*given)
     assert next(iter(signature.parameters.values())).annotation is command.options
 
