@@ -27,6 +27,7 @@ from landscape.probes import draw_probes
 
 SETTLED = 0.03  # share of a disagreement by which d(h) and d(2h) may differ: that of 1,100 kinks
 ROUNDS = 3  # of looking for the smallest step that round-off allows
+Gradient = Callable[[Tensor], Tensor]
 REMEDY = (
     "take .detach(), torch.no_grad(), numpy, @once_differentiable, reentrant checkpoints and weight_norm out of the loss, or "
     "write them with torch operations that have a second derivative"
@@ -34,10 +35,7 @@ REMEDY = (
 
 
 def require_hessian(
-    operator: SymmetricOperator,
-    gradient: Callable[[Tensor], Float[Tensor, " n"]],
-    center: Float[Tensor, " n"],
-    here: Float[Tensor, " n"],
+    operator: SymmetricOperator, gradient: Gradient, center: Float[Tensor, " n"], here: Float[Tensor, " n"]
 ) -> bool:
     """Whether differences of the gradient confirm H; False where kinks hide it.  Raises InputError where they refute it.
 
@@ -71,55 +69,40 @@ def require_hessian(
             f"expected products H v of a symmetric H, got v . H u and u . H v {2 * asymmetry / size:.1%} of |H v| "
             f"apart; {REMEDY}"
         )
-    if (off := _Differences(gradient, center, here, Hv, v).off(share, scale, slope)) > 0:
+    if (off := _off(gradient, center, here, Hv, v, share, scale)) > 0:
         raise InputError(
             f"expected products H v that are derivatives of the gradient, got ones {off:.1%} off its differences; {REMEDY}"
         )
     return off == 0
 
 
-class _Differences:
-    """Differences of a gradient along v, beside the product H v.  All in double precision, of gradients in the center's."""
+def _off(
+    gradient: Gradient, center: Tensor, here: Tensor, product: Tensor, v: Tensor, share: float, scale: float
+) -> float:
+    """0 where H v agrees with differences of the gradient, -1 where kinks hide it, else the relative distance between both.
 
-    def __init__(
-        self,
-        gradient: Callable[[Tensor], Tensor],
-        center: Float[Tensor, " n"],
-        here: Float[Tensor, " n"],
-        product: Float[Tensor, " n"],
-        v: Float[Tensor, " n"],
-    ) -> None:
-        self.gradient, self.center, self.here, self.product, self.v = gradient, center, here, product, v
+    All in double precision, of gradients in the center's.
+    """
+    theta = center.double()
 
-    def off(self, share: float, scale: float, slope: float) -> float:
-        """0 where H v agrees with them, -1 where kinks hide it, else the relative distance between both."""
-        eps, step, rounding = share**3, share * scale, None
-        for _ in range(1 + ROUNDS):
-            found = self.over(step)
-            apart, size = float((found - self.product).norm()), max(float(found.norm()), float(self.product.norm()))
-            if apart <= share * size + 10 * eps * slope / step:
-                return 0.0
-            if rounding is None:
-                rounding = self.rounding(eps)
-            elif float((found - self.over(2 * step)).norm()) <= SETTLED * apart and rounding / step <= SETTLED * apart:
-                return apart / size
-            # the step at which round-off is a tenth of the change to be resolved; nearer where the gradient is not finite
-            step = max(10 * rounding / (SETTLED * apart), eps * scale / SETTLED) if isfinite(apart) else share * step
-        return -1.0
+    def at(point: Tensor) -> Tensor:
+        return gradient(point.to(center.dtype)).double()
 
-    def over(self, step: float) -> Float[Tensor, " n"]:
+    def over(step: float) -> Tensor:
         """d(step)."""
-        ahead, behind = (
-            self.gradient((self.center.double() + sign * step * self.v).to(self.center.dtype)).double()
-            for sign in (1, -1)
-        )
-        return (ahead - behind) / (2 * step)
+        return (at(theta + step * v) - at(theta - step * v)) / (2 * step)
 
-    def rounding(self, eps: float) -> float:
-        """Length of the gradient's change when each number of the center is changed by 2 eps of itself."""
-        signs = torch.where(self.v > 0, 1.0, -1.0).double()
-        return float(
-            (
-                self.gradient((self.center.double() * (1 + 2 * eps * signs)).to(self.center.dtype)).double() - self.here
-            ).norm()
-        )
+    eps, step, rounding, slope = share**3, share * scale, None, float(here.double().norm())
+    for _ in range(1 + ROUNDS):
+        found = over(step)
+        apart, size = float((found - product).norm()), max(float(found.norm()), float(product.norm()))
+        if apart <= share * size + 10 * eps * slope / step:
+            return 0.0
+        if rounding is None:  # the gradient's change when each number of the center is changed by 2 eps of itself
+            signs = torch.where(v > 0, 1.0, -1.0).double()
+            rounding = float((at(theta * (1 + 2 * eps * signs)) - here).norm())
+        elif float((found - over(2 * step)).norm()) <= SETTLED * apart and rounding / step <= SETTLED * apart:
+            return apart / size
+        # the step at which round-off is a tenth of the change to be resolved; nearer where the gradient is not finite
+        step = max(10 * rounding / (SETTLED * apart), eps * scale / SETTLED) if isfinite(apart) else share * step
+    return -1.0

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -32,7 +33,7 @@ from splat.scenes.formats.llff import POSES, read_llff
 from splat.scenes.formats.transforms import BLENDER_FILES, SINGLE_FILE, read_blender, read_transforms
 from splat.scenes.images import Photo, frame, image_header, require_files
 from splat.scenes.layers import DEPTH_SUFFIXES, MASK_FOLDERS, MASK_SUFFIXES, find_layer
-from splat.scenes.view import Frame, Photograph, Points, View, ViewCache
+from splat.scenes.view import Frame, Photograph, Points, View
 
 PICTURES = 0.25  # of the free memory
 Kind = Literal["colmap", "llff", "blender", "transforms", "dtu", "synthetic"]
@@ -75,13 +76,13 @@ class Scene(ShortRepr):
         """
         frames = self.frames if names is None else self.select(names)
         room = int(PICTURES * free_memory(torch.device("cpu")))
-        shelf = ViewCache(room) if sum(frame.bytes for frame in frames) > room else None
         with ThreadPoolExecutor(max(1, min(len(frames), torch.get_num_threads()))) as readers:
-            if shelf is None:
-                return list(readers.map(lambda frame: frame.view(), frames))
+            if sum(frame.bytes for frame in frames) <= room:
+                return list(readers.map(Frame.view, frames))
             first = room // max(frame.bytes for frame in frames)
-            list(readers.map(shelf.view, frames[:first]))
-        return [Photograph(frame, shelf) for frame in frames]
+            read = lru_cache(max(first, 1))(Frame.view)
+            list(readers.map(read, frames[:first]))
+        return [Photograph(frame, read) for frame in frames]
 
     def extent(self, names: Sequence[str] | None = None) -> float:
         """`camera_extent` of these frames (all by default)."""
@@ -206,9 +207,8 @@ def _not_read(root: Path, *read: str) -> list[str]:
 def _with_layers(root: Path, photos: list[Photo], masks: Path | None, depths: Path | None) -> list[Photo]:
     """The photographs with the files beside them; a folder that was named must have some."""
     usual = [root / name for name in MASK_FOLDERS] + ([mask_folder(root)] if is_dtu(root) else [])
-    folders = [
-        inner for folder in ([masks] if masks else usual) for inner in (folder, folder / "mask") if inner.is_dir()
-    ]
+    inner = [each for folder in ([masks] if masks else usual) for each in (folder, folder / "mask")]
+    folders = [folder for folder in inner if folder.is_dir()]
     result = []
     for photo in photos:
         names = (photo.name, photo.path.name)

@@ -2,18 +2,16 @@
 
     View    a camera with its picture, as training and evaluation use it
     Frame   a camera whose picture is read from disk by `view()`, and larger by `whole_view()`; the camera is already final
-    ViewCache   as many views of frames as there is room for, the others as `Photograph`s, read when they are used
+    Photograph  a view of a frame, whose picture is read when it is used
     Points  coloured points of the scene, from structure from motion or a scanner, and the images that see each of them
 
 Pictures are (3, h, w) float32 in [0, 1], in the encoding of the file (no linearisation), composited over the scene's
 background where the file has an alpha channel.  World units and axes are those of the scene's files.
 """
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 from typing import Any, Literal
 
 import torch
@@ -96,37 +94,18 @@ class Frame:
         return (3 + len(self.layers)) * self.camera.width * self.camera.height * torch.float32.itemsize
 
 
-class ViewCache:
-    """Views of frames; the last used stay in memory, as many as fit into so many bytes, at least one."""
-
-    def __init__(self, memory: int):
-        self._memory, self._kept, self._lock = memory, OrderedDict[Frame, View](), Lock()
-
-    def view(self, frame: Frame) -> View:
-        with self._lock:
-            if frame in self._kept:
-                self._kept.move_to_end(frame)
-                return self._kept[frame]
-        found = frame.view()
-        with self._lock:
-            self._kept[frame] = found
-            while len(self._kept) > 1 and sum(each.bytes for each in self._kept) > self._memory:
-                self._kept.popitem(last=False)
-        return found
-
-
 class Photograph(View):
-    """A view of a shelf: its picture and what belongs to it are read when they are used, and may be read again."""
+    """A view whose picture and what belongs to it are read when they are used, and may be read again.  read: keeps the last."""
 
-    def __init__(self, frame: Frame, shelf: ViewCache):
-        for name, value in {"name": frame.name, "camera": frame.camera, "_frame": frame, "_shelf": shelf}.items():
+    def __init__(self, frame: Frame, read: Callable[[Frame], View]):
+        for name, value in {"name": frame.name, "camera": frame.camera, "_frame": frame, "_read": read}.items():
             object.__setattr__(self, name, value)
 
     def __getattribute__(self, name: str) -> Any:
         if name not in ("image", "alpha", "mask", "depth"):
             return object.__getattribute__(self, name)
         frame: Frame = self._frame  # pyright: ignore[reportAttributeAccessIssue]
-        return getattr(self._shelf.view(frame), name) if name == "image" or name in frame.layers else None  # pyright: ignore[reportAttributeAccessIssue]
+        return getattr(self._read(frame), name) if name == "image" or name in frame.layers else None  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @dataclass(frozen=True, eq=False)

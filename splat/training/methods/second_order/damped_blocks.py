@@ -9,6 +9,8 @@ With B the 11 x 11 blocks and the diagonal of SH, D the diagonal of P B P and <|
 The floor keeps Gaussians that are hardly seen, whose curvature is all but 0, from leaps.
 """
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -39,29 +41,24 @@ class DampedBlocks:
         """P V, of theta and y alike: a quaternion's four unknowns have one S."""
         return without_lengths(V, self.gaussians.quats, self._rows["quats"])
 
-    def inverse(self, damping: float, diagonal: bool = False) -> "Inverse":
-        """M; diagonal: of the diagonals alone (Jacobi)."""
+    def inverse(self, damping: float, diagonal: bool = False) -> Callable[[Float[Tensor, " p"]], Float[Tensor, " p"]]:
+        """P M P, as a function of a vector; diagonal: of the diagonals alone (Jacobi)."""
         found = self._absolute
         if diagonal:
             found = torch.diag_embed(found.diagonal(dim1=1, dim2=2) - self._radial.square())
         damped = found + damping * torch.eye(found.shape[1]).to(found)
-        return Inverse(self, torch.linalg.inv_ex(damped).inverse, 1 / (self._sh + damping))
+        inverted, sh = torch.linalg.inv_ex(damped).inverse, 1 / (self._sh + damping)
+
+        def apply(v: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
+            solved = (inverted @ self._geometry(v)[:, :, None])[:, :, 0]
+            parts = [solved[:, columns].flatten() for columns in GEOMETRY_COLUMNS.values()]
+            return self.project(torch.cat([*parts, sh * v[self._rows["sh"]]])[:, None])[:, 0]
+
+        return apply
 
     def _geometry(self, flat: Float[Tensor, " p"]) -> Float[Tensor, "n 11"]:
         n = len(self.gaussians)
         return torch.cat([flat[self._rows[name]].view(n, -1) for name in GEOMETRY_COLUMNS], dim=1)
-
-
-class Inverse:
-    """P M P as a function of a vector."""
-
-    def __init__(self, of: DampedBlocks, geometry: Float[Tensor, "n 11 11"], sh: Float[Tensor, " s"]):
-        self._of, self._inverted, self._sh = of, geometry, sh
-
-    def __call__(self, v: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
-        solved = (self._inverted @ self._of._geometry(v)[:, :, None])[:, :, 0]
-        parts = [solved[:, columns].flatten() for columns in GEOMETRY_COLUMNS.values()]
-        return self._of.project(torch.cat([*parts, self._sh * v[self._of._rows["sh"]]])[:, None])[:, 0]
 
 
 def _scale(gaussians: Gaussians, blocks: PerGaussianBlocks, floor: float) -> Float[Tensor, " p"]:
