@@ -16,11 +16,10 @@ from rich.console import Console
 
 from analysis.bench.accuracy.command import run_accuracy
 from analysis.bench.options import BenchOptions
-from analysis.bench.scene import VECTORS, ViewBench, per_vector
 from analysis.bench.stress import run_stress
 from analysis.bench.tables import rich_table, write_table
 from analysis.bench.timing import Meter, Timing, interleaved, meter_of
-from analysis.bench.workloads import Size, Workload, synthetic_workload, workload_of
+from analysis.bench.workloads import VECTORS, Size, ViewBench, Workload, per_vector, synthetic_workload, workload_of
 from analysis.console.plain import say
 from analysis.records.provenance import machine
 from landscape.errors import InputError
@@ -53,18 +52,15 @@ def run_bench(options: BenchOptions) -> int:
 
 def require(options: BenchOptions) -> None:
     """InputError where options do not go together."""
-    refusals = {
-        f"expected at least 1 repetition, got {options.repetitions}": options.repetitions < 1,
-        f"expected bench accuracy RUN, or one subject alone, got {options.subject} and {options.checkpoint or 'no run'}": (
-            (options.subject == "accuracy") != (options.checkpoint is not None)
-        ),
-        "expected a run, a scene or --sizes for the device cuda, as accuracy and stress are the CPU's; leave out --device": (
-            options.device == "cuda" and options.subject in ("stress", "accuracy")
-        ),
-    }
-    for sentence, wrong in refusals.items():
-        if wrong:
-            raise InputError(sentence)
+    if options.repetitions < 1:
+        raise InputError(f"expected at least 1 repetition, got {options.repetitions}")
+    if (options.subject == "accuracy") != (options.checkpoint is not None):
+        given = f"{options.subject} and {options.checkpoint or 'no run'}"
+        raise InputError(f"expected bench accuracy RUN, or one subject alone, got {given}")
+    if options.device == "cuda" and options.subject in ("stress", "accuracy"):
+        raise InputError(
+            "expected a run, a scene or --sizes for the device cuda, as accuracy and stress are the CPU's; leave out --device"
+        )
 
 
 def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:

@@ -1,23 +1,50 @@
-"""Workloads of a bench: Gaussians with the views that they are compared with, of a scene, a checkpoint or synthetic."""
+"""Workloads of a bench: Gaussians with the views that they are compared with, of a scene, a checkpoint or synthetic.
+
+First and second order of a scene's loss over one view, as they are timed.
+
+    rasterizer          splats to the image and back: tile lists, both passes over the pixels
+    gradient            the whole: projection, rasterizer, loss, and their adjoints
+    gradient, autograd  the same through the graph of torch, as a function of one's own takes it
+    gradient, atomic    ... with sums by atomic additions (on a GPU)
+    linearize           what `LinearizedView` does once
+    H v K               a product with K vectors, per vector
+    block diagonal      approximate Hessian blocks of all attributes, one pass
+    exact blocks        the same with SSIM's window (on a CPU)
+
+One code for the CPU and for GPUs: where the workload's Gaussians are decides which kernels run, and a `Meter` measures them.
+"""
 
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from analysis.bench.timing import Meter, Timing
 from landscape.errors import InputError
+from landscape.probes import draw_probes
+from splat.curvature.gaussian_blocks import PerGaussianBlocks
+from splat.curvature.linearize import LinearizedView
+from splat.losses.autograd import view_loss
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
-from splat.model.settings import RenderSettings
+from splat.model.settings import Accumulation, RenderSettings
+from splat.projection.formulas import lens_of
+from splat.render.backend import CPU, backend_of, plain_gradient
+from splat.render.render import render
 from splat.scenes.scene import load_scene
 from splat.scenes.splits import split_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.view import View
 from splat.training.checkpoint import open_subject
 from splat.training.start import gaussians_from_points
+
+VECTORS = (1, 4, 8)
+Calls = dict[str, Callable[[], object]]
 
 
 @dataclass(frozen=True)
@@ -91,3 +118,75 @@ def workload_of(path: Path) -> Workload:
     views = tuple(scene.load(split_scene(scene, 3).train))
     gaussians = gaussians_from_points(scene.points, scene.frames, sh_degree=3)
     return Workload(f"{scene.name}, start", gaussians, views, scene.background)
+
+
+class ViewBench:
+    """The first view of a workload, ready to be timed: calls by name, and what they work on."""
+
+    def __init__(self, workload: Workload):
+        self.workload, self.view = workload, workload.views[0]
+        self.like, camera = workload.gaussians.flat.detach(), self.view.camera
+        self.lens = lens_of(camera, workload.settings)
+        self.background = workload.background.to(self.like)
+        self.backend = backend_of(self.like)
+        self.loss = self.backend.view_loss(self.view.image, workload.loss, self.like)
+        self.projected = self.backend.project(workload.gaussians, self.lens)
+        self.raster = self._rasterize(self.projected)
+        self.cotangent = self.loss.linearize(self.raster.planes).gradient
+        self.linearized = self._linearize()
+        generator = torch.Generator(self.like.device).manual_seed(0)
+        self.vectors = {K: draw_probes(self.like.numel(), K, generator, self.like.dtype) for K in VECTORS}
+
+    def _rasterize(self, found: tuple[torch.Tensor, torch.Tensor, torch.Tensor]) -> Any:
+        camera, settings = self.view.camera, self.workload.settings
+        return self.backend.rasterize(*found, self.background, camera.width, camera.height, settings)
+
+    def _linearize(self) -> Any:
+        w = self.workload
+        return LinearizedView(w.gaussians, self.view.camera, self.loss, self.background, w.settings)
+
+    def gradient(self) -> torch.Tensor:
+        """Gradient of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
+        splats, depths, drawn = self.backend.project(self.workload.gaussians, self.lens)
+        raster = self._rasterize((splats, depths, drawn))
+        adjoint = raster.backward(self.loss.linearize(raster.planes, second_order=False).gradient)
+        return self._to_parameters(splats, drawn, adjoint)
+
+    def _to_parameters(self, splats: torch.Tensor, drawn: torch.Tensor, adjoint: Any) -> torch.Tensor:
+        bar = plain_gradient(splats, adjoint.moments)
+        return self.backend.project_vjp(self.workload.gaussians, self.lens, splats, drawn, bar)
+
+    def gradient_by_autograd(self, accumulation: Accumulation = "deterministic") -> torch.Tensor:
+        """The gradient through the graph of torch."""
+        w, settings = self.workload, replace(self.workload.settings, accumulation=accumulation)
+        flat = self.like.clone().requires_grad_()
+        image = render(w.gaussians.with_flat(flat), self.view.camera, self.background, settings).image
+        return torch.autograd.grad(view_loss(image, self.loss), flat)[0]
+
+    def calls(self) -> Calls:
+        """All that is timed."""
+        products = {f"H v {K}": lambda U=U: self.linearized.hvp(U) for K, U in self.vectors.items()}
+        return {
+            "rasterizer": lambda: self._rasterize(self.projected).backward(self.cotangent),
+            "gradient": self.gradient,
+            "gradient, autograd": self.gradient_by_autograd,
+            "linearize": self._linearize,
+            **products,
+            "block diagonal": self._block_diagonal,
+            **({"gradient, atomic": lambda: self.gradient_by_autograd("atomic")} if self.backend is not CPU else {}),
+            **({"exact blocks": self.linearized.block_diagonal} if self.backend.exact_blocks else {}),
+        }
+
+    def _block_diagonal(self) -> PerGaussianBlocks:
+        vars(self.linearized._loss).pop("diagonal", None)  # it keeps the loss's share, which is part of the cost
+        return self.linearized.block_diagonal(approximate=True)
+
+    def workspace(self, K: int, meter: Meter) -> int:
+        """Bytes that a product with K vectors allocates at most at a time, its result included."""
+        return meter.allocated(lambda: self.linearized.hvp(self.vectors[K]))
+
+
+def per_vector(times: Mapping[str, Timing]) -> dict[str, Timing]:
+    """Times per vector where the name ends in a number of vectors, as "H v 4"; the others as they are."""
+    widths = {name: name.rsplit(" ", 1)[-1] for name in times}
+    return {name: time / int(widths[name]) if widths[name].isdigit() else time for name, time in times.items()}

@@ -23,16 +23,7 @@ import tyro
 from rich.console import Console
 
 from analysis.bench.options import BenchOptions
-from analysis.commands.options import (
-    ConvertOptions,
-    DemoOptions,
-    MapOptions,
-    NextViewOptions,
-    PruneOptions,
-    SfmOptions,
-    UncertaintyOptions,
-    ViewOptions,
-)
+from analysis.commands import options as own
 from analysis.console.failures import report
 from analysis.console.interruption import interruption, loading
 from analysis.console.options import registry
@@ -81,10 +72,10 @@ class Command:
 
 GROUPS = {  # as a person works
     "make": {
-        "sfm": Command(SfmOptions, "commands.sfm:run_sfm", "PHOTOS"),
+        "sfm": Command(own.SfmOptions, "commands.sfm:run_sfm", "PHOTOS"),
         "train": Command(TrainOptions, "train.command:run_training", "SCENE --views 3 --out runs/fern", recorded=True),
         "sweep": Command(SweepOptions, "runs.sweep.sweep:run_sweep", "notebooks/study_small.toml"),
-        "demo": Command(DemoOptions, "commands.demo:run_demo", "", compiles=True),
+        "demo": Command(own.DemoOptions, "commands.demo:run_demo", "", compiles=True),
     },
     "measure": {
         "probe": Command(
@@ -96,19 +87,21 @@ GROUPS = {  # as a person works
         "bench": Command(BenchOptions, "bench.command:run_bench", "runs/fern"),
     },
     "see": {
-        "map": Command(MapOptions, "commands.map.command:run_map", "runs/fern", recorded=True, draws="maps"),
-        "view": Command(ViewOptions, "commands.view.command:run_view", "runs/fern", compiles=True),
+        "map": Command(own.MapOptions, "commands.map.command:run_map", "runs/fern", recorded=True, draws="maps"),
+        "view": Command(own.ViewOptions, "commands.view.command:run_view", "runs/fern", compiles=True),
     },
     "use": {
-        "prune": Command(PruneOptions, "commands.uses.prune:run_prune", "runs/fern --keep 0.5", recorded=True),
-        "next-view": Command(NextViewOptions, "commands.uses.next_view:run_next_view", "runs/fern", recorded=True),
+        "prune": Command(own.PruneOptions, "commands.uses.prune:run_prune", "runs/fern --keep 0.5", recorded=True),
+        "next-view": Command(own.NextViewOptions, "commands.uses.next_view:run_next_view", "runs/fern", recorded=True),
         "uncertainty": Command(
-            UncertaintyOptions, "commands.uses.uncertainty:run_uncertainty", "runs/fern", recorded=True
+            own.UncertaintyOptions, "commands.uses.uncertainty:run_uncertainty", "runs/fern", recorded=True
         ),
     },
     "exchange": {
         "convert": Command(
-            ConvertOptions, "commands.convert:run_convert", "point_cloud.ply runs/theirs/checkpoint.pt --scene SCENE"
+            own.ConvertOptions,
+            "commands.convert:run_convert",
+            "point_cloud.ply runs/theirs/checkpoint.pt --scene SCENE",
         )
     },
 }
@@ -249,7 +242,7 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     require_seed(getattr(options, "seed", 0))
     _require_compiler()
     _require_there(options)
-    if isinstance(options, ViewOptions) and find_spec("viser") is None:
+    if isinstance(options, own.ViewOptions) and find_spec("viser") is None:
         words = "expected the package viser, which shows a scene in the browser, got none; pip install -e '.[view]'"
         raise InputError(words)
     name, function = command.runs.split(":")

@@ -6,7 +6,7 @@
     RUN/psnr-X/checkpoint.pt    with --save-at-psnr: the first, of those that are looked at every LOOK steps, whose training
                                 views have X dB, by the mean of their squared errors; absent where none has
     RUN/train.csv               progress (`analysis/train/progress.py`)
-    RUN/seconds.json            time of the steps (`analysis/train/training_time.py`)
+    RUN/seconds.json            time of the steps (`analysis/train/progress.py`)
     RUN/history.csv             notes of the training method, a row each with its "step"; absent without any
     RUN/trajectory.csv, RUN/start/checkpoint.pt     with --probe-every: the landscape during the training
                                 (`analysis/train/trajectory.py`)
@@ -37,29 +37,29 @@ from analysis.console.overrides import assignments, overridden
 from analysis.console.plain import say
 from analysis.records.run_files import CHECKPOINT
 from analysis.train.options import TrainOptions
-from analysis.train.progress import TrainingProgress, scored, tracker_module
+from analysis.train.progress import TrainingProgress, TrainingTime, scored, tracker_module
 from analysis.train.remarks import begins, remarks
 from analysis.train.scores import report
-from analysis.train.source import from_checkpoint
-from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
 from landscape.errors import InputError, did_you_mean
 from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
+from splat.model.files.read import is_foreign
+from splat.model.gaussians import Gaussians
 from splat.model.typed import leaves, typed
 from splat.model.untrusted import beside, locked, replacing
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, explicit_split, read_names, split_scene, usual_views
 from splat.scenes.view import View
-from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
+from splat.training.checkpoint import load_checkpoint, open_checkpoint, save_checkpoint, write_atomically
 from splat.training.densify import DensifySettings
 from splat.training.loop import prepare, train
-from splat.training.methods.methods import METHODS
-from splat.training.methods.protocols import presets
+from splat.training.methods.methods import METHODS, presets
 from splat.training.origin.fingerprint import Fingerprint
+from splat.training.origin.foreign import REGULARIZERS
 from splat.training.origin.frames import posed, shift_to_origin
-from splat.training.origin.scene_reference import SceneReference
-from splat.training.origin.subject import Checkpoint
+from splat.training.origin.options import Foreign
+from splat.training.origin.subject import Checkpoint, SceneReference
 from splat.training.score.evaluate import have_masks
 from splat.training.start import Source, initial_gaussians
 from splat.training.state import TrainConfig, Training
@@ -118,10 +118,8 @@ class Run:
         if history := self.training.method.history:
             write_atomically(self.out / HISTORY, pd.DataFrame(history).to_csv(index=False).encode())
         if self.keep != "all":
-            steps = [
-                path.parent.name.removeprefix("step-") for path in self.out.glob(f"{KEPT.format('*')}/{CHECKPOINT}")
-            ]
-            kept = sorted(int(step) for step in steps if step.isdigit())
+            folders = (path.parent.name for path in self.out.glob(f"{KEPT.format('*')}/{CHECKPOINT}"))
+            kept = sorted(int(step) for name in folders if (step := name.removeprefix("step-")).isdigit())
             for step in kept[: max(len(kept) - self.keep, 0)]:
                 (folder := self.out / KEPT.format(step)).joinpath(CHECKPOINT).unlink()
                 if not any(folder.iterdir()):  # a probe of the checkpoint may lie there
@@ -208,9 +206,8 @@ def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig
     scene = load_scene(options.scene, options.images, options.downscale, colour, options.masks, options.depths)
     split = _split(options, scene)
     start = typed(Source, options.start or preset.get("start", "scene"), "start")
-    reference = SceneReference.to(
-        scene, out / CHECKPOINT, split, options.images, options.downscale, start, options.depths, options.masks
-    )
+    seen = options.images, options.downscale, start, options.depths, options.masks
+    reference = SceneReference.to(scene, out / CHECKPOINT, split, *seen)
     shift = None if options.from_ else shift_to_origin(scene)  # a checkpoint brings its world
     world = None if shift is None else shift.tolist()
     return posed(scene, world, centred=False), split, _config(options, scene), replace(reference, similarity=world)
@@ -311,3 +308,43 @@ def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, cons
             if stop:
                 return interrupted.exit_code if done.step < total else 0
     return 0
+
+
+Planned = tuple[Scene, Split, TrainConfig, SceneReference]
+
+
+def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Planned, Gaussians | None]:
+    """The plan in the checkpoint's world and with its renderer, and its Gaussians; the plan as it is without --from.
+
+    Density control begins and recurs after as many steps as in a long training, unless --set says otherwise: each of the rounds
+    that a short training from points has would double the Gaussians of a trained scene before the last ones have moved.
+    InputError where the checkpoint is refused, and where --set changes its renderer or --trained-by has no file to speak of.
+    """
+    scene, split, config, reference = plan
+    asked, train = Foreign(**vars(options.foreign)), None
+    if options.from_ is None:
+        if asked != Foreign():
+            raise InputError(
+                "expected --from beside --trained-by, --antialiased, --opacity-reg or --scale-reg, which speak of its file, "
+                "got none"
+            )
+        return plan, None
+    changes = assignments(options.set)
+    if any(key.startswith("render.") for key in changes):
+        raise InputError("expected --from, which brings its renderer, or --set render..., got both; leave one out")
+    regularized = [name for name in REGULARIZERS if getattr(asked, name) is not None]
+    if twice := [name for name in regularized if f"loss.{name}" in changes]:
+        raise InputError(f"expected --{twice[0].replace('_', '-')} or --set loss.{twice[0]}, got both; leave one out")
+    if is_foreign(options.from_):
+        asked = replace(asked, scene=options.scene, images=options.images, downscale=options.downscale)
+        train = split.train
+    found = open_checkpoint(options.from_, asked, out, train)
+    world = found.scene
+    scene = posed(scene, world.similarity, centred=world.centred)
+    reference = replace(reference, similarity=world.similarity, centred=world.centred)
+    theirs = found.training.config
+    weights = {name: getattr(theirs.loss, name) for name in regularized}
+    loss = replace(config.loss, border=theirs.loss.border, **weights)
+    whole = {name: 1.0 for name in ("start_share", "every_share") if f"densify.{name}" not in changes}
+    config = replace(config, render=theirs.render, loss=loss, densify=replace(config.densify, **whole))
+    return (scene, split, config, reference), found.training.gaussians

@@ -1,6 +1,7 @@
 """Progress of a training: rows of RUN/train.csv, a line of the terminal for each where there is no bar, a tracker if asked.
 
 RUN/train.csv           a row before the first step, every --log-every steps and after the last; complete lines at any time
+RUN/seconds.json        `TrainingTime`, written after every checkpoint
 RUN/tracked/            with --track: the same numbers for TensorBoard, Weights & Biases or trackio
 
 Columns:
@@ -10,18 +11,24 @@ loss, psnr         of the first training view as it would be rendered then: the 
 seconds, cpu       that the steps so far took, by the clock and of all processors together, without loading, saving and scoring
 """
 
+import sys
+from collections.abc import Iterable, Iterator
 from importlib import import_module
 from math import inf, isnan, nan
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
+from time import perf_counter, process_time
 from typing import Any
 
+import msgspec
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from analysis.console.plain import say
-from analysis.train.training_time import TrainingTime
+from analysis.records.json_files import read_json
+from analysis.records.run_files import SECONDS, Seconds
 from landscape.errors import InputError
 from splat.losses.autograd import view_loss
 from splat.losses.reference import psnr
@@ -37,6 +44,41 @@ COLUMNS = ("step", "loss", "psnr", "gaussians", "seconds", "cpu")
 # a run whose Gaussians become more than FAST times those of its start in this share of it says why
 EARLY, FAST = 0.1, 3
 SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
+
+
+class TrainingTime(Seconds):
+    """Time of a training's steps until one of them, over resumes, without loading, saving and scoring; and its peak memory.
+
+    A kernel that has to be compiled first counts in.
+    """
+
+    @classmethod
+    def read(cls, run: Path) -> "TrainingTime":
+        """Time of a run folder; zero where it has not been saved yet."""
+        if not (path := run / SECONDS).is_file():
+            return cls(0, 0.0, 0.0)
+        remedy = "remove it: nothing but the time until its last checkpoint is lost"
+        return read_json(path, cls, "the seconds of a training", remedy)
+
+    def write(self, run: Path) -> None:
+        unit = 1 if sys.platform == "darwin" else 1024
+        self.peak = max(self.peak or 0, unit * getrusage(RUSAGE_SELF).ru_maxrss)
+        write_atomically(run / SECONDS, msgspec.json.encode(self) + b"\n")
+
+    def timed(self, steps: Iterable[StepResult]) -> Iterator[StepResult]:
+        """The same steps; the time that each takes is added up as it is made."""
+        iterator = iter(steps)
+        threads = torch.get_num_threads()
+        self.threads = threads if self.threads == threads or self.step == 0 else None
+        while True:
+            wall, cpu = perf_counter(), process_time()
+            done = next(iterator, None)
+            if done is None:
+                return
+            self.step = done.step
+            self.wall += perf_counter() - wall
+            self.cpu += process_time() - cpu
+            yield done
 
 
 class TrainingProgress:

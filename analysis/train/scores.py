@@ -25,14 +25,13 @@ from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance
 from analysis.records.quantities import PLACES, SCORES
 from analysis.records.run_files import CHECKPOINT, METRICS
-from analysis.train.training_time import TrainingTime
+from analysis.train.progress import TrainingTime
 from splat.model.untrusted import short, write_atomically
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.view import View
 from splat.scenes.write import bytes_of, png
 from splat.training.origin.fingerprint import Fingerprint
-from splat.training.score.evaluate import Evaluation, ViewScore, evaluate
-from splat.training.score.perceptual import MissingPerceptual, load_lpips
+from splat.training.score.evaluate import Evaluation, MissingPerceptual, ViewScore, evaluate, load_lpips
 from splat.training.state import Training
 
 RENDERS, PANELS = "test", "panels"

@@ -38,22 +38,15 @@ import pandas as pd
 import torch
 
 from analysis.records.run_files import RECORDS, read_trajectory
-from landscape import (
-    CountingOperator,
-    EigenSettings,
-    SpectralDensity,
-    TraceSettings,
-    anisotropy,
-    extreme_eigenpairs,
-    spectral_density,
-)
+from landscape import CountingOperator, EigenSettings, TraceSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.operators.operator import LiftedOperator
 from landscape.probes import spawn
-from landscape.spectrum.anisotropy import Anisotropy
-from landscape.spectrum.density import ActiveSpace
+from landscape.spectrum.anisotropy import Anisotropy, anisotropy
+from landscape.spectrum.density import ActiveSpace, spectral_density
 from landscape.spectrum.monitor import COLUMNS as MEASURED
+from landscape.spectrum.rules import SpectralDensity
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import total_trace
 from splat.curvature.block_eigenvectors import BlockEigenvectors
@@ -62,8 +55,7 @@ from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, block_traces, exact_traces
 from splat.model.untrusted import read_table, write_atomically
 from splat.scenes.view import View
-from splat.training.origin.scene_reference import SceneReference
-from splat.training.origin.subject import Checkpoint
+from splat.training.origin.subject import Checkpoint, SceneReference
 from splat.training.state import Training
 
 START = "start"
@@ -101,19 +93,18 @@ class Found:
         return anisotropy(self.ends, self.density)
 
 
+@dataclass(eq=False)
 class Trajectory:
     """The records of one run.  Reads those of an interrupted run, up to the training's step."""
 
-    def __init__(
-        self,
-        run: Path,
-        training: Training,
-        views: Sequence[View],
-        settings: TrajectorySettings,
-        reference: SceneReference,
-    ) -> None:
-        self.run, self.training, self.views, self.settings, self.reference = run, training, views, settings, reference
-        self.rows = _read_rows(run / RECORDS, training.step)
+    run: Path
+    training: Training
+    views: Sequence[View]
+    settings: TrajectorySettings
+    reference: SceneReference
+
+    def __post_init__(self) -> None:
+        self.rows = _read_rows(self.run / RECORDS, self.training.step)
 
     def before_steps(self) -> None:
         """Record the start."""
@@ -188,9 +179,8 @@ def measure(objective: SceneObjective, generator: torch.Generator, settings: Tra
     density = None
     if whole:
         active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)
-        density = spectral_density(
-            operator, streams[2], settings.density_matvecs, active=active, ends=ends, trace=trace
-        )
+        most = settings.density_matvecs
+        density = spectral_density(operator, streams[2], most, active=active, ends=ends, trace=trace)
     return Found(traces, ends, density, operator.matvecs)
 
 

@@ -10,9 +10,8 @@ from typing import Any
 
 import torch
 
-from analysis.bench.scene import ViewBench
 from analysis.bench.timing import interleaved, meter_of
-from analysis.bench.workloads import Size, Workload, synthetic_workload, workload_of
+from analysis.bench.workloads import Size, ViewBench, Workload, synthetic_workload, workload_of
 from analysis.console.failures import program
 from splat.backend.device import device_named
 from splat.losses.autograd import view_loss

@@ -44,7 +44,7 @@ from notebooks.paper.effects import STRETCHED
 from notebooks.paper.table import FILE, KEYS, read_table
 from splat.model.typed import leaves
 from splat.training.checkpoint import load_checkpoint
-from splat.training.methods.protocols import presets
+from splat.training.methods.methods import presets
 from splat.training.start import Source
 from splat.training.state import TrainConfig
 

@@ -27,7 +27,6 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, t_quantile
-from landscape.traces.control import controlled
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.hutchinson import CONFIRMATION, WIDENING, StoppingRule, TraceSettings
 from splat.curvature.objective import SceneObjective
@@ -35,6 +34,8 @@ from splat.model.gaussians import ATTRIBUTES
 
 SAMPLED = "exact, but SSIM's window is sampled"
 ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
+EPS = torch.finfo(torch.float64).eps
+ROUND_OFFS = 10  # of the sum of squares: a smaller spread of the other controls means that they are equal
 LEAST_SAMPLES = 4  # for a mean, a slope, and a variance with two degrees of freedom
 COLUMNS = 5  # most vectors in a pass over the pixels: one for each attribute
 
@@ -127,9 +128,8 @@ def carried_traces(objective: SceneObjective, ratios: Mapping[str, tuple[float, 
 
 def _pixel_traces(objective: SceneObjective, names: Collection[str]) -> tuple[dict[str, float], dict[str, float]]:
     """T_b and C_b of the named blocks; no C_b where the loss does not couple pixels."""
-    whole, coupled = (
-        {} if blocks is None else blocks.traces(objective.active.quats) for blocks in objective.approximate_blocks
-    )
+    quats = objective.active.quats
+    whole, coupled = ({} if blocks is None else blocks.traces(quats) for blocks in objective.approximate_blocks)
     return {name: whole[name] for name in names}, coupled
 
 
@@ -270,3 +270,23 @@ def _signs(
             rows = objective.blocks[name]
             U[rows, i, j] = z[rows]
     return U
+
+
+def controlled(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> Float64[Tensor, " s"]:
+    """samples - c (control - mean), where c is fitted for each sample to all others by least squares (0 if their controls are
+    equal; fewer than 3 samples are returned as they are).
+
+    >>> x = torch.tensor([1.0, 2.0, 4.0, 8.0]).double()
+    >>> controlled(3 * x + 5, x, mean=2.0).round(decimals=9)  # 3 x + 5 has the mean 11, and x explains all of it
+    tensor([11., 11., 11., 11.], dtype=torch.float64)
+    """
+    if len(samples) < 3:
+        return samples
+    x, y = samples - samples.mean(), control - control.mean()
+    unit = float(y.abs().max()) or 1.0
+    y = y / unit  # squares of y may leave the range of floats
+    left = len(samples) / (len(samples) - 1)  # the means move, too, when a sample is left out
+    cross, spread = (x * y).sum() - left * x * y, y.square().sum() - left * y.square()
+    varies = spread > ROUND_OFFS * EPS * y.square().sum()
+    slope = torch.where(varies, cross / spread.clamp_min(1e-300), torch.zeros_like(cross))
+    return samples - slope * ((control - mean) / unit)

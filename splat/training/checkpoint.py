@@ -27,8 +27,7 @@ from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
 from splat.training.origin.foreign import foreign_training
 from splat.training.origin.options import FILE, KIND, OF_ALL, Foreign, require_checkpoint
-from splat.training.origin.scene_reference import SceneReference
-from splat.training.origin.subject import Checkpoint, Subject
+from splat.training.origin.subject import Checkpoint, SceneReference, Subject
 from splat.training.state import Method, TrainConfig, Training
 
 FORMAT, VERSION = "splat-landscape checkpoint", 3

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.linalg import group_sums
-from splat.model.capture import common_target
+from splat.model.camera import common_target
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.scenes.scene import Scene

@@ -15,7 +15,7 @@ from PIL import Image
 from analysis.commands.map.fields import measured_fields
 from analysis.commands.map.pictures import rendered
 from analysis.commands.view import viewer as view
-from analysis.commands.view.page import offline_page
+from analysis.commands.view.command import offline_page
 from analysis.runs.compare import render_page
 from analysis.runs.compare_table import Run, comparison
 from analysis.runs.seeds import Group, grouped

@@ -151,7 +151,7 @@ def _write_numbers_of_a_run(root: Path) -> None:
 
 def _use_numbers_of_a_run(root: Path, chance: Random) -> Read:
     from analysis.records.run_files import read_comparison, read_scores
-    from analysis.train.training_time import TrainingTime
+    from analysis.train.progress import TrainingTime
 
     for read in (read_scores, read_comparison, TrainingTime.read):
         read(root)

@@ -21,8 +21,7 @@ from notebooks.paper.predictors import predictors
 from notebooks.paper.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, judgements
 from notebooks.paper.study import _hutchinson, _more, _runs, method_name, study, unended
 from notebooks.statistics import DRAWS
-from splat.training.methods.methods import METHODS
-from splat.training.methods.protocols import presets
+from splat.training.methods.methods import METHODS, presets
 from splat.training.start import Source
 from splat.training.state import TrainConfig
 from tests.recorded import synthetic, written

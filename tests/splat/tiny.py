@@ -15,7 +15,7 @@ from splat.scenes.view import View
 from splat.training.densify import DensifySettings
 from splat.training.loop import train
 from splat.training.origin.fingerprint import ViewData
-from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import SceneReference
 from splat.training.state import MethodSettings, Step, TrainConfig, Training
 
 SMOOTH = RenderSettings(alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)  # no threshold that can be off

@@ -20,11 +20,14 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import torch
+from jaxtyping import Bool, Float64
 from rich.console import Console
+from torch import Tensor
 
 from analysis.commands.map.fields import ENDS, PROBE, Fields, in_words, measured_fields
-from analysis.commands.map.files import coloured_ply, fields_ply, top_table
 from analysis.commands.map.pictures import error_shade, view_maps, write_maps
 from analysis.commands.options import MapOptions
 from analysis.console.drawing import Draw
@@ -35,7 +38,7 @@ from analysis.measures.fragility import fragility, fragility_sentences
 from analysis.measures.steepest import steepest
 from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance_of
-from analysis.records.quantities import Shade
+from analysis.records.quantities import GREY, Shade
 from analysis.records.records import record_folder, require_replaceable
 from analysis.records.run_files import MAP, Fragility, MapRecord, Panel, Steepest
 from landscape.errors import InputError
@@ -43,7 +46,10 @@ from landscape.results import Progress
 from splat.backend.cpu.threads import single_threaded
 from splat.curvature.fields import FIELDS, Field, Values
 from splat.curvature.objective import SceneObjective
+from splat.model.files.splat_ply import splat_ply
 from splat.model.gaussians import Gaussians
+from splat.model.harmonics import Y00
+from splat.projection.antialias import baked
 from splat.scenes.view import View
 from splat.training.checkpoint import open_subject
 from splat.training.origin.subject import Checkpoint
@@ -176,3 +182,40 @@ def _conclude(data: MapRecord, first: Mapping[str, Any], kind: Field, out: Path)
     names = [re.sub(r"-\d{3,}[.]", "-NNN.", path.name) for path in sorted(out.glob("*.png"))]
     pictures = ", ".join(dict.fromkeys(names)) or "none"
     say(f"pictures: {pictures}; splats: fields.ply, {data.field}.ply; table: top.csv; in {out}")
+
+
+TOP = 100
+
+
+def fields_ply(gaussians: Gaussians, seen: Bool[Tensor, " n"], values: Values) -> bytes:
+    """All Gaussians with their fields, nan out of sight."""
+    extra = {}
+    for name, column in values.items():
+        extra[name] = np.full(len(gaussians), np.nan, np.float32)
+        extra[name][seen.numpy()] = column.numpy()
+    return splat_ply(gaussians, extra)
+
+
+def coloured_ply(gaussians: Gaussians, seen: Bool[Tensor, " n"], shade: Shade, values: Float64[Tensor, " m"]) -> bytes:
+    """All Gaussians, each in the colour of its value, the same from everywhere."""
+    rgb = torch.full((len(gaussians), 3), GREY / 255)
+    rgb[seen] = torch.from_numpy(shade.colours_of(values.numpy()))
+    attributes = gaussians.attributes | {"sh": ((rgb - 0.5) / Y00)[:, None].to(gaussians.flat)}
+    return splat_ply(baked(Gaussians.pack(attributes).with_filter(gaussians.filter_widths)))
+
+
+def top_table(objective: SceneObjective, values: Values, by: str) -> pd.DataFrame:
+    """The Gaussians with the largest |field|, or the smallest `order_gap`: every number, place, size and opacity of each.
+
+    gaussian: its number among all of the checkpoint.  sigma_0 to 2: standard deviations, world units, the largest first.
+    """
+    column = values[by].abs()
+    order = torch.where(column.isnan(), -torch.inf, -column if by == "order_gap" else column)
+    chosen = order.argsort(descending=True, stable=True)[:TOP]
+    active = objective.active
+    sigmas = active.log_scales[chosen].double().exp().sort(dim=1, descending=True).values
+    table = {"gaussian": objective.mask.nonzero()[:, 0][chosen].numpy()}
+    table |= {name: found[chosen].numpy() for name, found in values.items()}
+    table |= dict(zip("xyz", active.means[chosen].double().numpy().T))
+    table |= {f"sigma_{i}": sigma for i, sigma in enumerate(sigmas.numpy().T)}
+    return pd.DataFrame(table | {"opacity": active.opacity_logits[chosen].double().sigmoid().numpy()})

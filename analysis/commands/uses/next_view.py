@@ -35,8 +35,7 @@ from landscape.errors import InputError
 from splat.curvature.scores.information import GAINS, Information, gains, gains_of_each, informations, prior_of
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import open_subject
-from splat.training.origin.scene_reference import data_of
-from splat.training.origin.subject import Checkpoint
+from splat.training.origin.subject import Checkpoint, data_of
 
 RECORD = "next-view.json"  # the file by which a folder of results is known
 

@@ -1,4 +1,4 @@
-"""`landscape uncertainty`: variances of held-out views' pixels (`splat.curvature.scores.uncertainty`) beside their true errors.
+"""`landscape uncertainty`: variances of held-out views' pixels (`splat.curvature.scores.information`) beside their true errors.
 
     agreement.csv       by view and by precision (the blocks of the Gaussians, or their diagonal alone): Spearman's rank
                         correlation of variance and |error| over the pixels, and AUSE
@@ -29,8 +29,7 @@ from analysis.records.quantities import quantity
 from analysis.records.records import record_folder, require_replaceable
 from landscape.errors import InputError
 from splat.curvature.linearize import LinearizedView
-from splat.curvature.scores.information import Information, informations, prior_of
-from splat.curvature.scores.uncertainty import pixel_variance
+from splat.curvature.scores.information import Information, informations, pixel_variance, prior_of
 from splat.losses.reference import LossSettings
 from splat.render.backend import CPU
 from splat.scenes.view import View
@@ -66,9 +65,8 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
             total = total + prior_of(total)
         with stages.stage("views") as report:
             for place, view in enumerate(held_out):
-                linearized = LinearizedView(
-                    gaussians, view.camera, CPU.view_loss(view.image, L2, gaussians.flat), background, config.render
-                )
+                loss = CPU.view_loss(view.image, L2, gaussians.flat)
+                linearized = LinearizedView(gaussians, view.camera, loss, background, config.render)
                 found, maps = _compared(linearized, view, total, generator, options.samples)
                 rows += found
                 np.savez(folder / f"view-{place:03d}.npz", **maps)
@@ -93,7 +91,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
 def _compared(
     linearized: LinearizedView, view: View, total: Information, generator: torch.Generator, samples: int
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Rows of the table and maps of one held-out view.  total: B of `splat.curvature.scores.uncertainty`."""
+    """Rows of the table and maps of one held-out view.  total: B of `splat.curvature.scores.information`."""
     error = (linearized.image.clamp(0, 1) - view.image).abs().mean(dim=0).double().numpy()
     rows, maps = [], {"photograph": view.image.permute(1, 2, 0).numpy(), "error": error}
     for name, diagonal in PRECISIONS.items():

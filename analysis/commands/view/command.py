@@ -1,4 +1,8 @@
-"""`landscape view`: serve the viewer, or write a page that needs no server."""
+"""`landscape view`: serve the viewer, or write a page that needs no server.
+
+In such a page viser's only control is the tree of its nodes, so every field is a node with splats of its own.  One
+is visible; the panel switches by the tree.
+"""
 
 from importlib import import_module
 from pathlib import Path
@@ -11,13 +15,13 @@ from torch import Tensor
 
 from analysis.commands.map.fields import ENDS, PROBE, measured_fields
 from analysis.commands.options import ViewOptions
-from analysis.commands.view.page import offline_page
 from analysis.commands.view.viewer import APPEARANCE, Viewer
 from analysis.console.options import require_known
 from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.measures.steepest import heaviest_view
 from analysis.measures.units import RISE, UNITS
+from analysis.records.page import report
 from analysis.records.records import recorded_probe
 from landscape import curvature_reach
 from landscape.errors import InputError
@@ -72,8 +76,6 @@ def _server(viser: Any, options: ViewOptions) -> Any:
 
 def _link_from_report(run: Path, page: Path) -> None:
     """Write the probe's report anew, if there is one and the page lies where it links to."""
-    from analysis.records.page import report  # half a second of imports
-
     if page.resolve() == (run / report.SPLATS).resolve() and (run / PROBE / report.FILE).is_file():
         report.write_report(run / PROBE)
 
@@ -91,3 +93,27 @@ def steepest_directions(objective: SceneObjective, probe: Path, made: Fingerprin
         for i, (name, value) in enumerate(values.items())
         if value and i < vectors.shape[1]
     }
+
+
+OFFLINE = ("largest", "trace_means", "trace_quats", "split", "condition", "one_view", "order_gap")
+
+
+def offline_page(viewer: Viewer, shown: str) -> str:
+    """The page of a viewer with fields: its appearance, `shown` and the fields OFFLINE, and the ends of the spectrum."""
+    fields, scene, entries = viewer.fields, viewer.server.scene, []
+    assert fields is not None
+    viewer.splats.remove()
+    for name in dict.fromkeys((APPEARANCE, shown, *OFFLINE, *fields.ends)):
+        words, colours, legend = APPEARANCE, viewer.plain, ""
+        if name != APPEARANCE:
+            shade = fields.shade(name)
+            words, colours = fields.kinds[name].words, shade.colours_of(fields.values[name].numpy())
+            legend = f"{shade.unit}{shade.legend}10th to 98th percentile, by weight"
+        scene.add_gaussian_splats(
+            f"/{words}", **viewer.frame.splats(viewer.objective.active), rgbs=colours, opacities=viewer.opacities,
+            visible=name == shown,
+        )  # fmt: skip
+        entries.append({"words": words, "legend": legend, "shown": name == shown})
+    page, panel = scene.as_html(), report.template_environment(Path(__file__).parent).get_template("panel.html.jinja")
+    end = page.rindex("</body>")
+    return page[:end] + panel.render(entries=entries) + page[end:]

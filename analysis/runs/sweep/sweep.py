@@ -40,7 +40,7 @@ from analysis.runs.options import SweepOptions
 from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_results import PROBE, summarize, tables, unfinished, write_results
 from analysis.train.command import planned, resumed
-from analysis.train.training_time import TrainingTime
+from analysis.train.progress import TrainingTime
 from landscape.errors import InputError
 from splat.model.untrusted import Taken, locked
 from splat.training.origin.subject import Checkpoint

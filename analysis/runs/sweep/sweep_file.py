@@ -33,8 +33,7 @@ from analysis.probe.options import ProbeOptions
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError
 from splat.model.untrusted import read_toml, require_name
-from splat.training.methods.methods import METHODS
-from splat.training.methods.protocols import presets
+from splat.training.methods.methods import METHODS, presets
 from splat.training.origin.options import Trainer
 
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own

@@ -1,4 +1,4 @@
-"""Row space of the Hessian in the SH coefficients of each Gaussian; `null_space.py` has the formulas.
+"""Row space of the Hessian in the SH coefficients of each Gaussian; `active_spaces.py` has the formulas.
 
 It is spanned by the harmonics Y(d_m) of the views m, for each channel that m does not clamp, and by at most three slopes
 sum_m a_mc dY(d_m)/dmu_j, vectors over all channels.  Mostly no channel is clamped, and the three channels share a basis.

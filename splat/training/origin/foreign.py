@@ -30,7 +30,7 @@ from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_f
 from splat.training.origin.likeness import Reading, likeliest
 from splat.training.origin.options import Foreign
 from splat.training.origin.presets import PRESETS, Preset, World, preset_of, render_of
-from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import SceneReference
 from splat.training.state import TrainConfig, Training
 
 TURNED_BACK = "its y and z axes are those of a PLY, not of its format, as the photographs show"
@@ -71,13 +71,7 @@ def foreign_training(
     moved = posed(scene, similarity, centred=preset.centred)
     training = Training.start(reading.gaussians, moved.extent(split.train), config)
     training.step = found.step or 0
-    notes = [
-        *found.notes,
-        *reading.notes,
-        *preset.different,
-        *_left_out(found, config.loss),
-        *([LOSSY] if found.lossy else []),
-    ]
+    notes = [*found.notes, *reading.notes, *preset.different, *_left_out(found, config.loss)] + [LOSSY] * found.lossy
     said = {"format": found.format, "trained_by": name, "trained_by_source": source, "views": how, "notes": notes}
     said |= {"images": images, "downscale": downscale}
     conventions = asdict(replace(preset, render=render, loss=config.loss))

@@ -28,8 +28,7 @@ import torch
 from jaxtyping import Float
 
 from landscape.errors import InputError
-from splat.model.camera import Camera
-from splat.model.capture import common_target
+from splat.model.camera import Camera, common_target
 from splat.model.untrusted import loose_json
 from splat.scenes.formats.transforms import SINGLE_FILE
 from splat.scenes.scene import Scene

@@ -1,6 +1,7 @@
 """Subjects: what is measured, pictured and used, a checkpoint with its scene; `splat.open_subject` opens them."""
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 
 import torch
 
-from landscape.errors import TooLittleMemory
+from landscape.errors import InputError, TooLittleMemory
 from landscape.results import ShortRepr
 from splat.backend.memory import free_memory
 from splat.curvature.objective import SceneObjective
@@ -16,15 +17,116 @@ from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.model.typed import leaves
 from splat.model.untrusted import loose_json
-from splat.scenes.scene import Scene
-from splat.scenes.splits import spread_views
+from splat.scenes.scene import Scene, load_scene
+from splat.scenes.splits import Split, spread_views
 from splat.scenes.view import Frame
-from splat.training.origin.fingerprint import Fingerprint, ViewData, changes, state_of
+from splat.training.origin.fingerprint import Data, Fingerprint, ViewData, changes, in_short, state_of
 from splat.training.origin.frames import posed
-from splat.training.origin.scene_reference import SceneReference, data_of
+from splat.training.start import Source
 from splat.training.state import Training
 
 PLANES, COPIES = 12, 4  # in memory: planes of a view, its loss's included; copies of the Gaussians
+
+
+@dataclass(frozen=True)
+class SceneReference:
+    """Reference to the scene of a training, to load it as it was.
+
+    absolute, relative: the scene's folder, and the same from the checkpoint's folder.  images: the folder of images in
+    it, where one was named; downscale: the factor by which its images were reduced further.  train, test: names of the views;
+    views: what was seen of each.  start: what the Gaussians started from (`splat/training/start.py`); depths, masks: the
+    folders of depth maps and masks, where one was named.  similarity, centred: as `posed` takes them, where another tool
+    trained in another world.
+    """
+
+    absolute: str
+    relative: str
+    images: str | None
+    downscale: float
+    train: list[str]
+    test: list[str]
+    views: dict[str, ViewData]
+    start: Source = "scene"
+    depths: str | None = None
+    masks: str | None = None
+    similarity: list[list[float]] | None = None
+    centred: bool = False
+
+    @classmethod
+    def to(
+        cls,
+        scene: Scene,
+        checkpoint: Path,
+        split: Split,
+        images: str | None,
+        downscale: float,
+        start: Source = "scene",
+        depths: Path | None = None,
+        masks: Path | None = None,
+    ) -> "SceneReference":
+        """The scene, loaded with these images, downscale, depths and masks, as seen from where the checkpoint will lie."""
+        return cls(
+            absolute=str(scene.root),
+            relative=os.path.relpath(scene.root, checkpoint.parent.resolve()),
+            images=images,
+            downscale=float(downscale),
+            train=list(split.train),
+            test=list(split.test),
+            views=data_of(scene, [*split.train, *split.test]),
+            start=start,
+            depths=None if depths is None else str(depths.resolve()),
+            masks=None if masks is None else str(masks.resolve()),
+        )
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Width and height of the training views, px."""
+        return [self.views[name].size for name in self.train]
+
+    def find(self, checkpoint: Path) -> Path:
+        """The scene's folder: seen from the checkpoint, else where it lay.  FileNotFoundError if in neither."""
+        candidates = [(checkpoint.parent / self.relative).resolve(), Path(self.absolute)]
+        for folder in candidates:
+            if folder.is_dir():
+                return folder
+        raise FileNotFoundError(
+            f"expected the scene of {checkpoint} at {' or '.join(str(c) for c in dict.fromkeys(candidates))}, "
+            "found no such folder; pass where it is now with --scene"
+        )
+
+    def load(self, checkpoint: Path, background: tuple[float, float, float], folder: Path | None = None) -> Scene:
+        """The scene as its files have it now, in its own world, on this background.
+
+        checkpoint: the file that this was read from; folder: where the scene has moved to.  A COLMAP model's points, from which
+        the Gaussians started, are not read again.  FileNotFoundError where there is no such folder; InputError where the scene
+        lacks a view.
+        """
+        there = self.find(checkpoint) if folder is None else folder
+        masks = Path(self.masks) if self.masks and Path(self.masks).is_dir() else None
+        try:
+            scene = load_scene(there, self.images, self.downscale, background, masks, points=False)
+            scene.select([*self.train, *self.test])
+        except (InputError, FileNotFoundError) as error:
+            if folder is None or not there.is_dir():
+                raise
+            name = Path(self.absolute).name
+            raise InputError(
+                f"expected the training's scene {name} in {there}, got another or a part: {error}"
+            ) from error
+        return scene
+
+    def require_unchanged(self, now: Data, folder: Path | str, remedy: str = "restore them or train anew") -> None:
+        """InputError that says what has changed in the views since the training."""
+        if changed := changes(self.views, now):
+            raise InputError(
+                f"expected the views of {folder} as they were in the training, got changes in {len(changed)} of "
+                f"{len(self.views)}: {in_short(changed)}; {remedy}"
+            )
+
+
+def data_of(scene: Scene, names: list[str]) -> dict[str, ViewData]:
+    """What there is now to be seen of these views."""
+    return {frame.name: ViewData.of(frame) for frame in scene.select(names)}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -137,9 +239,8 @@ def _require_room(frames: Sequence[Frame], gaussians: Gaussians) -> None:
     if (needed := fixed + sum(each)) <= left:
         return
     some = (left - fixed) // max(each)
-    enough = (
-        f"--max-views {some} would fit" if some > 0 else f"allow or free at least {(needed - left) / 1e6:.3g} MB more"
-    )
+    more = f"allow or free at least {(needed - left) / 1e6:.3g} MB more"
+    enough = f"--max-views {some} would fit" if some > 0 else more
     raise TooLittleMemory(
         f"expected {needed / 1e6:.3g} MB of memory beside what is taken, for {len(frames)} pictures and "
         f"{len(gaussians):,} Gaussians, got {left / 1e6:.3g} MB; {enough}"

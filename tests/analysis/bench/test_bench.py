@@ -9,9 +9,8 @@ import torch
 
 from analysis.bench.command import run_bench
 from analysis.bench.options import BenchOptions
-from analysis.bench.scene import ViewBench
 from analysis.bench.timing import Meter, Timing, interleaved
-from analysis.bench.workloads import Size, synthetic_workload
+from analysis.bench.workloads import Size, ViewBench, synthetic_workload
 from analysis.commands.cli import main
 from splat.curvature.objective import SceneObjective
 from splat.render.formulas import SPLAT

@@ -11,9 +11,8 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from analysis.bench import command as bench
 from analysis.bench.options import BenchOptions
-from analysis.bench.scene import ViewBench
 from analysis.bench.timing import Meter, Timing
-from analysis.bench.workloads import Workload
+from analysis.bench.workloads import ViewBench, Workload
 from splat.losses.reference import LossSettings
 from tests.splat.gpu.interpreted import emulate
 from tests.splat.held_scenes import two_views

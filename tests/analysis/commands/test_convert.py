@@ -19,7 +19,7 @@ from splat.scenes.splits import split_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
-from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import SceneReference
 from splat.training.state import TrainConfig, Training
 from tests.splat.model.files import written
 

@@ -20,7 +20,7 @@ from splat.scenes.synthetic import synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import save_checkpoint
 from splat.training.origin.fingerprint import FORMULAS
-from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import SceneReference
 from splat.training.state import TrainConfig, Training
 from tests.analysis.probe.probed import SCENE
 

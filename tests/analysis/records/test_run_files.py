@@ -10,7 +10,7 @@ from analysis.records.run_files import Scores, ViewScores, read_scores
 from analysis.runs.sweep.sweep_file import Cell
 from analysis.runs.sweep.sweep_results import results
 from analysis.train.options import TrainOptions
-from analysis.train.training_time import TrainingTime
+from analysis.train.progress import TrainingTime
 from tests.refusals import refused
 
 SCORES = {"psnr": 20.0, "ssim": 0.5, "lpips": None}

@@ -35,7 +35,7 @@ from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings
 from splat.training.methods.corgs import CoRGS
-from splat.training.methods.second_order.gn_cg import GaussNewtonCG
+from splat.training.methods.second_order.solvers import GaussNewtonCG
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.origin.frames import posed, shift_in_words, shift_of
 from splat.training.origin.subject import Checkpoint

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from landscape.traces.control import controlled
+from splat.curvature.traces import controlled
 from tests.landscape.spectra import generator
 
 

@@ -7,12 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from landscape.traces.control import controlled
 from landscape.traces.trace import TraceSettings
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.linearize import VECTORS, LinearizedView
 from splat.curvature.objective import SceneObjective
-from splat.curvature.traces import LEAST_SAMPLES, SampledTrace, _signs, coupling_samples, exact_traces
+from splat.curvature.traces import LEAST_SAMPLES, SampledTrace, _signs, controlled, coupling_samples, exact_traces
 from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera

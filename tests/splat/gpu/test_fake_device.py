@@ -21,7 +21,7 @@ from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.training.loop import train
 from splat.training.methods.corgs import _pruned, confirmed
-from splat.training.methods.depth.fsgs import FSGS, unpool
+from splat.training.methods.depth import FSGS, unpool
 from splat.training.state import Training
 from tests.splat.gpu.fake_device import FakeDevice
 from tests.splat.gpu.interpreted import emulate

@@ -9,8 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from splat.model.camera import Camera, look_at
-from splat.model.capture import capture_geometry, common_target, forward_facing
+from splat.model.camera import Camera, capture_geometry, common_target, forward_facing, look_at
 from splat.scenes.scene import load_scene
 from splat.scenes.splits import split_scene
 

@@ -9,10 +9,8 @@ import torch
 from splat.model.typed import Count, typed
 from splat.training.densify import DensifySettings
 from splat.training.methods.corgs import CoRGS
-from splat.training.methods.depth.dngaussian import DNGaussian
-from splat.training.methods.depth.fsgs import FSGS
-from splat.training.methods.dropout.dropgaussian import DropGaussian
-from splat.training.methods.dropout.dropoutgs import DropoutGS
+from splat.training.methods.depth import FSGS, DNGaussian
+from splat.training.methods.dropout import DropGaussian, DropoutGS
 from splat.training.methods.sam import SAM
 from splat.training.methods.stablegs.attribute_probe import Caps, Constants, ProbeSettings
 from splat.training.methods.stablegs.stablegs import StableGS

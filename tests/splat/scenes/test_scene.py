@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splat.model.camera import Camera
-from splat.model.capture import forward_facing
+from splat.model.camera import Camera, forward_facing
 from splat.scenes.scene import Scene, camera_extent, load_scene
 from splat.scenes.view import Frame, View
 from tests.refusals import refused

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splat.model.camera import Camera
-from splat.model.capture import forward_facing
+from splat.model.camera import Camera, forward_facing
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import rotation_matrices
 from splat.render.render import render

@@ -62,8 +62,7 @@ from landscape.traces.trace import PAPER, estimate_traces
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import NothingInSight, SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, carried_traces, coupling_ratios, exact_traces
-from splat.model.camera import Camera
-from splat.model.capture import capture_geometry
+from splat.model.camera import Camera, capture_geometry
 from splat.model.gaussians import Gaussians
 from splat.model.typed import LARGEST, Count, Length, NonNegative, typed
 from splat.render.loss_and_gradient import LossAndGradient
@@ -71,19 +70,9 @@ from splat.render.render import render_depth
 from splat.scenes.view import View
 from splat.training.densify import DensifySettings
 from splat.training.methods.agreement import agreement
-from splat.training.methods.dropout.dropgaussian import rising_dropout
-from splat.training.methods.stablegs.attribute_probe import (
-    DRAWN,
-    Attribute,
-    Magnitude,
-    ProbeSettings,
-    draw_seeds,
-    draw_steps,
-    magnitudes,
-    probe_attributes,
-)
-from splat.training.methods.stablegs.occlusion_edge import dominant_edge
-from splat.training.methods.stablegs.viewpoint_probe import ViewpointSettings, composite_pose
+from splat.training.methods.dropout import rising_dropout
+from splat.training.methods.stablegs import attribute_probe as asp
+from splat.training.methods.stablegs.viewpoint_probe import ViewpointSettings, composite_pose, dominant_edge
 from splat.training.state import Method, MethodSettings, Step, TrainConfig, Training
 
 PAPERS_STEPS = 10_000
@@ -122,7 +111,7 @@ class StableGS(MethodSettings):
     antithetic: bool = True
     densify_after_warm_up: bool = False
     drop_share: Annotated[float, Meta(ge=0, lt=1)] = 0.0
-    probe: ProbeSettings = field(default_factory=ProbeSettings)
+    probe: asp.ProbeSettings = field(default_factory=asp.ProbeSettings)
     viewpoint: ViewpointSettings = field(default_factory=ViewpointSettings)
 
     def create(self, seed: int) -> Method:
@@ -160,7 +149,7 @@ class StableGSMethod(Method[StableGS]):
 
     def __init__(self, settings: StableGS, seed: int):
         super().__init__(settings, seed)
-        self.magnitudes: dict[str, Magnitude] = {}
+        self.magnitudes: dict[str, asp.Magnitude] = {}
         self.normals: list[Tensor] = []
         self.coupling: dict[str, tuple[float, float]] = {}
         self.pair: tuple[list[int], int] | None = None
@@ -191,7 +180,7 @@ class StableGSMethod(Method[StableGS]):
         if not self.magnitudes:
             return replace(base, gradient=(1 + settings.asp_weight) * base.gradient)
         draws, sign = self._draws(step.gaussians)
-        probed = probe_attributes(
+        probed = asp.probe_attributes(
             step.gaussians, base.gradient, step.camera, base.splats, self.magnitudes, settings.probe, draws, sign
         )
         in_base, in_probed = None, None  # gradients: of the agreement in Theta, of both losses in Theta'
@@ -218,9 +207,9 @@ class StableGSMethod(Method[StableGS]):
         pair, drawn = self.pair, self._drawn
         self.pair = self._drawn = None
         if pair and pair[1] == gaussians.flat.numel():
-            return (drawn or draw_steps(gaussians, self.magnitudes, pair[0])), -1.0
-        seeds = draw_seeds(self.generator)
-        drawn = draw_steps(gaussians, self.magnitudes, seeds)
+            return (drawn or asp.draw_steps(gaussians, self.magnitudes, pair[0])), -1.0
+        seeds = asp.draw_seeds(self.generator)
+        drawn = asp.draw_steps(gaussians, self.magnitudes, seeds)
         if self.settings.antithetic:
             self.pair, self._drawn = (seeds, gaussians.flat.numel()), drawn
         return drawn, 1.0
@@ -236,7 +225,7 @@ class StableGSMethod(Method[StableGS]):
         estimates = self.traces(objective, sampled=sampled)
         values, active = {name: estimate.value for name, estimate in estimates.items()}, len(objective.active)
         degree, extent = step.gaussians.sh_degree, step.training.extent
-        self.magnitudes = magnitudes(values, active, degree, extent, settings.probe)
+        self.magnitudes = asp.magnitudes(values, active, degree, extent, settings.probe)
         for name, magnitude in self.magnitudes.items():
             row = {"step": step.number, "attribute": name, **asdict(magnitude)}
             row |= {"standard_error": estimates[name].standard_error, "samples": estimates[name].probes}
@@ -296,12 +285,12 @@ class StableGSMethod(Method[StableGS]):
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
-        self.magnitudes = typed(dict[Attribute, Magnitude], state["magnitudes"], "magnitudes")
+        self.magnitudes = typed(dict[asp.Attribute, asp.Magnitude], state["magnitudes"], "magnitudes")
         self.normals = typed(list[Tensor], state["normals"], "normals")
-        self.coupling = typed(dict[Attribute, tuple[Ratio, NonNegative]], state["coupling"], "coupling")
+        self.coupling = typed(dict[asp.Attribute, tuple[Ratio, NonNegative]], state["coupling"], "coupling")
         self.pair = typed(tuple[list[Count], Count] | None, state["pair"], "pair")
-        if self.pair and len(self.pair[0]) != len(DRAWN):
-            raise InputError(f"'pair': expected {len(DRAWN)} seeds, got {len(self.pair[0])}")
+        if self.pair and len(self.pair[0]) != len(asp.DRAWN):
+            raise InputError(f"'pair': expected {len(asp.DRAWN)} seeds, got {len(self.pair[0])}")
         if not all(normal.shape == (2,) for normal in self.normals):
             raise InputError("'normals': expected vectors of two numbers")
 

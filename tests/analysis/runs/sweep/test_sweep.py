@@ -23,7 +23,7 @@ from analysis.runs.sweep.sweep import CELLS_ELSEWHERE, _Cells, lock_of, missing,
 from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_results import results
 from analysis.train.options import TrainOptions
-from analysis.train.training_time import TrainingTime
+from analysis.train.progress import TrainingTime
 from splat.model.untrusted import locked
 from splat.render.forward import background_of
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene

@@ -15,7 +15,7 @@ from analysis.records.quantities import PLUS_MINUS
 from analysis.runs.sweep.sweep_file import Cell
 from analysis.runs.sweep.sweep_results import REASONS, results, summarize, tables, unfinished, with_ratios
 from analysis.train.options import TrainOptions
-from analysis.train.training_time import TrainingTime
+from analysis.train.progress import TrainingTime
 from splat.training.loop import StepResult
 from tests.recorded import soft, synthetic, written
 

@@ -12,9 +12,8 @@ from landscape.operators.operator import DenseOperator
 from landscape.spectrum.absolute_sum import absolute_sum
 from landscape.spectrum.density import ActiveSpace, spectral_density
 from splat.curvature.hessian import SceneHessian
-from splat.curvature.null.active_spaces import projector_of
+from splat.curvature.null.active_spaces import projector_of, seen_parameters
 from splat.curvature.null.colour_space import ColourSpace, seen_colours
-from splat.curvature.null.null_space import seen_parameters
 from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, row_space
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings

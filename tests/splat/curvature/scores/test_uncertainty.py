@@ -5,8 +5,7 @@ import torch
 
 from splat.curvature.fields import complement
 from splat.curvature.linearize import LinearizedView
-from splat.curvature.scores.information import information, prior_of
-from splat.curvature.scores.uncertainty import pixel_variance, pushed
+from splat.curvature.scores.information import information, pixel_variance, prior_of, pushed
 from splat.losses.reference import LossSettings
 from splat.render.backend import backend_of
 from tests.splat.held_scenes import BACKGROUND

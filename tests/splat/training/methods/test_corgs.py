@@ -6,8 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from splat.model.camera import Camera
-from splat.model.capture import capture_geometry
+from splat.model.camera import Camera, capture_geometry
 from splat.render.render import render
 from splat.training.densify import DensifySettings
 from splat.training.loop import train

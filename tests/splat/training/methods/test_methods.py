@@ -12,14 +12,11 @@ from splat.scenes.view import View
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.loop import train
 from splat.training.methods.corgs import CoRGS
-from splat.training.methods.depth.dngaussian import DNGaussian
-from splat.training.methods.depth.fsgs import FSGS
-from splat.training.methods.dropout.dropgaussian import DropGaussian
-from splat.training.methods.dropout.dropoutgs import DropoutGS
+from splat.training.methods.depth import FSGS, DNGaussian
+from splat.training.methods.dropout import DropGaussian, DropoutGS
 from splat.training.methods.methods import METHODS, ThreeDGS
 from splat.training.methods.sam import SAM
-from splat.training.methods.second_order.gn_cg import GaussNewtonCG
-from splat.training.methods.second_order.newton_blocks import NewtonBlocks
+from splat.training.methods.second_order.solvers import GaussNewtonCG, NewtonBlocks
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.state import MethodSettings, Training
 from tests.splat.tiny import EXTENT, REFERENCE, ended, tiny_config, tiny_gaussians, tiny_views, trained

@@ -8,8 +8,7 @@ from analysis.console.overrides import overridden
 from analysis.train.command import OPTIONS
 from analysis.train.options import TrainOptions
 from splat.model.typed import leaves
-from splat.training.methods.methods import METHODS
-from splat.training.methods.protocols import presets, table
+from splat.training.methods.methods import METHODS, presets, table
 from splat.training.state import TrainConfig
 from tests.refusals import refused
 

@@ -27,8 +27,7 @@ from splat.training.loop import train
 from splat.training.origin.likeness import LEAST_PSNR, MARGIN
 from splat.training.origin.options import Foreign
 from splat.training.origin.presets import PRESETS
-from splat.training.origin.scene_reference import SceneReference
-from splat.training.origin.subject import Checkpoint
+from splat.training.origin.subject import Checkpoint, SceneReference
 from splat.training.state import TrainConfig, Training
 from tests.refusals import refused
 from tests.splat.model.files import written

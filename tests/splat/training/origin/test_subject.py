@@ -14,7 +14,7 @@ from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import open_subject, save_checkpoint
 from splat.training.origin import subject
 from splat.training.origin.options import Foreign
-from splat.training.origin.scene_reference import SceneReference
+from splat.training.origin.subject import SceneReference
 from splat.training.state import TrainConfig, Training
 from tests.refusals import refused
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from splat.training.score.perceptual import MissingPerceptual, load_lpips
+from splat.training.score.evaluate import MissingPerceptual, load_lpips
 
 
 class Network(nn.Module):
@@ -71,6 +71,6 @@ def test_a_torchvision_that_does_not_fit_torch_is_a_missing_package(monkeypatch:
     def fail(name: str) -> ModuleType:
         raise RuntimeError("operator torchvision::nms does not exist")
 
-    monkeypatch.setattr("splat.training.score.perceptual.import_module", fail)
+    monkeypatch.setattr("splat.training.score.evaluate.import_module", fail)
     with pytest.raises(MissingPerceptual, match="torchvision::nms does not exist; to have it, install"):
         load_lpips()

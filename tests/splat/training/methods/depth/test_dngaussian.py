@@ -9,8 +9,7 @@ import torch
 from splat.model.gaussians import Gaussians
 from splat.render.render import render
 from splat.training.loop import train
-from splat.training.methods.depth import dngaussian
-from splat.training.methods.depth.dngaussian import DNGaussian, normalised
+from splat.training.methods.depth import DNGaussian, normalised
 from splat.training.state import Step, TrainConfig, Training
 from tests.refusals import refused
 from tests.splat.tiny import EXTENT, HEIGHT, WIDTH, a_step, both_of, tiny_gaussians, tiny_views
@@ -113,7 +112,7 @@ def test_a_loss_of_weight_0_adds_nothing_but_the_draws_stay_the_same():
 
 
 def test_where_nothing_is_seen_depth_adds_nothing_and_is_not_normalised(monkeypatch):
-    monkeypatch.setattr(dngaussian, "normalised", None)
+    monkeypatch.setattr("splat.training.methods.depth.normalised", None)
     step = step_of(DNGaussian(soft_start=0))
     step.gaussians.means[:, 2] = -3.0
     assert not added(step).flat.any()

@@ -9,8 +9,7 @@ import torch
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.loop import train
-from splat.training.methods.depth import fsgs
-from splat.training.methods.depth.fsgs import FSGS, depth_loss, unpool
+from splat.training.methods.depth import FSGS, depth_loss, unpool
 from splat.training.methods.methods import ThreeDGS
 from splat.training.state import Training
 from tests.splat.tiny import EXTENT, HEIGHT, WIDTH, a_step, both_of, tiny_config, tiny_gaussians, tiny_views, trained
@@ -121,7 +120,7 @@ def test_the_gradient_is_that_of_the_loss_and_the_weighted_depth_term(number, we
 
 
 def test_where_nothing_is_seen_depth_adds_nothing_and_is_not_correlated(monkeypatch):
-    monkeypatch.setattr(fsgs, "depth_loss", None)
+    monkeypatch.setattr("splat.training.methods.depth.depth_loss", None)
     step = a_step(FSGS(), views=with_depths(tiny_views(torch.float64)))
     step.gaussians.means[:, 2] = -3.0
     base, whole = both_of(step)

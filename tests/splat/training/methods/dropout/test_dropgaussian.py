@@ -8,7 +8,7 @@ import torch
 
 from splat.render.render import render
 from splat.training.loop import train
-from splat.training.methods.dropout.dropgaussian import DropGaussian, DropGaussianMethod
+from splat.training.methods.dropout import DropGaussian, DropGaussianMethod
 from splat.training.state import TrainConfig, Training
 from tests.splat.photometric import photometric_loss
 from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views, trained

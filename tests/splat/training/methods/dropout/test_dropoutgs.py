@@ -5,16 +5,15 @@ import torch
 
 from splat.losses.reference import LossSettings
 from splat.render.render import render
-from splat.training.methods.dropout import dropoutgs
-from splat.training.methods.dropout.dropoutgs import DropoutGS
+from splat.training.methods.dropout import DropoutGS, dropout
 from tests.splat.photometric import photometric_loss
 from tests.splat.tiny import a_step, both_of
 
 
 @pytest.mark.parametrize("literal", [False, True])
 def test_the_gradient_is_that_of_the_loss_and_of_the_agreement(monkeypatch, literal):
-    masks, draw = [], dropoutgs.dropout
-    monkeypatch.setattr(dropoutgs, "dropout", lambda *a: masks.append(draw(*a)) or masks[-1])
+    masks, draw = [], dropout
+    monkeypatch.setattr("splat.training.methods.dropout.dropout", lambda *a: masks.append(draw(*a)) or masks[-1])
     loss, background = LossSettings(literal=literal), (0.2, 0.4, 0.1)
     step = a_step(DropoutGS(p=0.5, weight=0.3), loss=loss, background=background)
     gradient, image = both_of(step)[1].gradient, step.views[1].image

@@ -15,8 +15,7 @@ from splat.model.gaussians import Gaussians
 from splat.render.render import render
 from splat.training.loop import train
 from splat.training.methods.second_order.damped_blocks import absolute
-from splat.training.methods.second_order.gn_cg import GaussNewtonCG
-from splat.training.methods.second_order.newton_blocks import NewtonBlocks, minimum
+from splat.training.methods.second_order.solvers import GaussNewtonCG, NewtonBlocks, minimum
 from splat.training.methods.second_order.steps import FALLS, RISES, LocalModel, SecondOrder
 from splat.training.state import Training
 from tests.oracles import absolute_matrix

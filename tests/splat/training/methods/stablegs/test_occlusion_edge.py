@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splat.training.methods.stablegs.occlusion_edge import _sobel, dominant_edge
+from splat.training.methods.stablegs.viewpoint_probe import _sobel, dominant_edge
 
 
 def grid(height: int = 60, width: int = 80) -> tuple[Tensor, Tensor]:

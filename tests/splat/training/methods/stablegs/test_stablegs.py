@@ -34,8 +34,8 @@ READINGS = [{}, {"asp_views": "all"}, {"viewpoints": "all", "vsp_gradient": "pro
 def test_the_gradient_is_that_of_the_total_loss_with_constant_probes(monkeypatch, reading):
     settings = StableGS(warm_up=0, asp_weight=0.7, vsp_weight=0.3, probe=PROBE, **reading)
     step, probes, poses = a_step(settings, background=(0.2, 0.4, 0.1)), [], []
-    probing, posing = stablegs.probe_attributes, stablegs.composite_pose
-    monkeypatch.setattr(stablegs, "probe_attributes", lambda *a: probes.append(probing(*a)) or probes[-1])
+    probing, posing = stablegs.asp.probe_attributes, stablegs.composite_pose
+    monkeypatch.setattr(stablegs.asp, "probe_attributes", lambda *a: probes.append(probing(*a)) or probes[-1])
     monkeypatch.setattr(stablegs, "composite_pose", lambda *a, **k: poses.append(posing(*a, **k)) or poses[-1])
     gradient = both_of(step)[1].gradient
     assert len(probes) == 1 and len(poses) == (3 if "viewpoints" in reading else 1)
@@ -197,8 +197,8 @@ def test_what_makes_it_cheaper_leaves_the_expectation_of_the_gradient():
 
 
 def test_two_steps_share_the_numbers_of_a_probe_with_opposite_signs(monkeypatch):
-    step, seen, probing = a_step(StableGS(warm_up=0, probe=PROBE)), [], stablegs.probe_attributes
-    monkeypatch.setattr(stablegs, "probe_attributes", lambda *a: seen.append(a[-2:]) or probing(*a))
+    step, seen, probing = a_step(StableGS(warm_up=0, probe=PROBE)), [], stablegs.asp.probe_attributes
+    monkeypatch.setattr(stablegs.asp, "probe_attributes", lambda *a: seen.append(a[-2:]) or probing(*a))
     grown = step.gaussians.select(torch.arange(13) % 12)
     for gaussians in [step.gaussians] * 5 + [grown]:  # of another number the numbers are new
         both_of(replace(step, gaussians=gaussians))

@@ -12,14 +12,18 @@ from scipy.linalg import fractional_matrix_power
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from splat.model.camera import Camera, slerp
-from splat.model.capture import CaptureGeometry, capture_geometry
+from splat.model.camera import Camera, CaptureGeometry, capture_geometry, slerp
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.render.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
-from splat.training.methods.stablegs.occlusion_edge import dominant_edge
-from splat.training.methods.stablegs.viewpoint_probe import ViewpointSettings, composite_pose, edge_axis, nearest_camera
+from splat.training.methods.stablegs.viewpoint_probe import (
+    ViewpointSettings,
+    composite_pose,
+    dominant_edge,
+    edge_axis,
+    nearest_camera,
+)
 from tests.refusals import refused
 
 NONE = ViewpointSettings(edge_rotation=False, interpolation=False, parallax=False, capture="forward")

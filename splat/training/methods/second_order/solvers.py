@@ -1,4 +1,6 @@
-"""newton-blocks: every Gaussian's own damped Newton step, all at once, and one exact minimum along it.
+"""The two ways in which a method of second order solves for its step.
+
+newton-blocks: every Gaussian's own damped Newton step, all at once, and one exact minimum along it.
 
     y = M b,   M = (|blocks| + lambda)^-1       as if each Gaussian were alone (`damped_blocks.py`)
     c          the model's minimum in the plane of y and the last step, from one product of both with the whole Hessian;
@@ -6,6 +8,12 @@
 
 The blocks leave out what Gaussians over one pixel have to do with each other, which c restores in part.  The plane is that of
 K-FAC (Martens and Grosse 2015, Sec. 7); without momentum it is the line along y.
+
+gn-cg: Gauss-Newton, or Newton, over all parameters and views at once, by preconditioned conjugate gradients.
+
+(A + lambda) y = b (`steps.py`) to a residual of rtol, or with so many products, which are exact.  The preconditioner M is of
+the Gaussians' own blocks; that of published methods, 3DGS-LM (Hoellein et al., ICCV 2025) and LM-RS (arXiv 2504.12905), is the
+diagonal of J^T J.  Where conjugate gradients meet negative curvature they end with what they have, and lambda rises.
 """
 
 from dataclasses import dataclass
@@ -16,9 +24,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.linalg import gram, norm
+from landscape.linalg import column_dots, gram, norm
+from landscape.operators.cg import conjugate_gradients
 from landscape.operators.operator import product
 from splat.model.gaussians import Gaussians
+from splat.model.typed import Length, Share
 from splat.training.methods.second_order.steps import LocalModel, Proposal, SecondOrder, SecondOrderMethod
 
 
@@ -72,3 +82,26 @@ def minimum(A: Float[Tensor, "k k"], b: Float[Tensor, " k"]) -> Float[Tensor, " 
     values, parts = values.abs(), vectors.T @ b
     kept = values > 1e-6 * values.max()
     return vectors @ torch.where(kept, parts / values.where(kept, torch.ones_like(values)), 0.0)
+
+
+@dataclass(frozen=True)
+class GaussNewtonCG(SecondOrder):
+    """rtol, products: when conjugate gradients end.  preconditioner: the blocks, or their diagonals alone (Jacobi)."""
+
+    name: Literal["gn-cg"] = "gn-cg"
+    preconditioner: Literal["blocks", "diagonal"] = "blocks"
+    rtol: Share = 0.1
+    products: Length = 20
+
+    def create(self, seed: int) -> "GaussNewtonCGMethod":
+        return GaussNewtonCGMethod(self, seed)
+
+
+class GaussNewtonCGMethod(SecondOrderMethod[GaussNewtonCG]):
+    def propose(self, local: LocalModel, damping: float) -> Proposal:
+        settings = self.settings
+        M = local.metric.inverse(damping, diagonal=settings.preconditioner == "diagonal")
+        found = conjugate_gradients(local.A, local.b, M, damping, settings.rtol, settings.products)
+        y, curved = found.x, found.Ax - damping * found.x
+        fall = float(column_dots((local.b - curved / 2)[:, None], y[:, None]))
+        return Proposal(y, fall, found.reason == "negative curvature")
