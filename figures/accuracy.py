@@ -67,15 +67,7 @@ def _panel(axes: Axes, part: pd.DataFrame, looks: dict[tuple[str, str], tuple[st
             label=literal(method),
         )  # fmt: skip
     default = part[part["origin"] == "default"]
-    axes.plot(
-        default["matvecs"],
-        default["true_error"],
-        linestyle="none",
-        marker="*",
-        markersize=7,
-        color=BLACK,
-        label="default",
-    )
+    axes.plot(default["matvecs"], default["true_error"], "*", markersize=7, color=BLACK, label="default")
 
 
 def draw_all(path: Path) -> Iterator[tuple[str, Figure]]:

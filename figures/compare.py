@@ -113,9 +113,7 @@ def draw_densities(records: Records) -> Figure:
         panels[0].set_ylim(0.5 / most, 2)  # one direction is a share of 1 / parameters
         panels[0].set_ylabel("share of directions\nat least so curved")
         handles = [Line2D([], [], color=BLACK, label="end of the spectrum", **END)] * bool(ends)
-        words = unresolved_share(
-            *(record.arrays["spectrum"] for record in records.values() if "spectrum" in record.arrays)
-        )
+        words = unresolved_share(*(record.arrays.get("spectrum", {}) for record in records.values()))
         handles += [Line2D([], [], linestyle="none", label=words)] * bool(words)
         _legend(figure, records, *handles)
     return figure
@@ -186,9 +184,8 @@ def draw_sections(records: Records) -> Figure:
 
 def _looks(records: Records) -> list[dict[str, str]]:
     """Colour and line of each run."""
-    return [
-        {"color": RUNS[i % len(RUNS)], "linestyle": LINES[i // len(RUNS) % len(LINES)]} for i in range(len(records))
-    ]
+    numbers = (divmod(i, len(RUNS)) for i in range(len(records)))
+    return [{"color": RUNS[colour], "linestyle": LINES[line % len(LINES)]} for line, colour in numbers]
 
 
 def _legend(figure: Figure, records: Records, *more: Line2D, marker: str = "") -> None:

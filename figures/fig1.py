@@ -20,18 +20,8 @@ from scipy.ndimage import uniform_filter
 from analysis.console.failures import program
 from analysis.records.quantities import rough
 from analysis.records.run_files import METRICS, read_scores
+from figures import manifold
 from figures.fig7 import names_of, read_all
-from figures.manifold import (
-    Scale,
-    contours,
-    doubt_of,
-    landscape_of,
-    record_of,
-    require_same_function,
-    runs_script,
-    section,
-    surface,
-)
 from figures.plane import Plane
 from figures.style import BLUE, VERMILION, literal, new_figure, style
 from landscape.errors import InputError
@@ -44,15 +34,15 @@ ALONG = {"e₁": VERMILION, "e₂": BLUE}
 def draw(runs: Sequence[Path]) -> Figure:
     """Fig. 1 of two runs.  ValueError names every record that is missing, each with the command that makes it."""
     names = names_of(runs)
-    found = read_all(*(partial(landscape_of, run) for run in runs), *(partial(_views, run) for run in runs))
+    found = read_all(*(partial(manifold.landscape_of, run) for run in runs), *(partial(_views, run) for run in runs))
     landscapes = found[:2]
-    require_same_function(runs)
+    manifold.require_same_function(runs)
     if not (common := found[2] & found[3]):
         raise InputError(
             f"expected a view that both {runs[0]} and {runs[1]} have rendered, found none; train on one scene"
         )
     view = min(common)
-    scale = Scale.of(*landscapes)
+    scale = manifold.Scale.of(*landscapes)
     sections = scale.of_sections(*landscapes)
     with style():
         figure = new_figure(7.4, WIDTH)
@@ -67,24 +57,23 @@ def draw(runs: Sequence[Path]) -> Figure:
             pictures[0].imshow(photograph[part])
             pictures[0].set_title(f"part of {literal(view)}\n(held out)")
         for i, (run, name, landscape) in enumerate(zip(runs, names, landscapes, strict=True)):
-            surface(above, (3, 2, 1 + i), landscape, scale, _heading(i, runs, names, landscapes))
-            filled = contours(maps[i], landscape, scale)
+            manifold.surface(above, (3, 2, 1 + i), landscape, scale, _heading(i, runs, names, landscapes))
+            filled = manifold.contours(maps[i], landscape, scale)
             across = above.add_subplot(3, 2, 5 + i)
             for axis, colour in enumerate(ALONG.values()):
-                section(across, landscape, sections, axis, color=colour)
+                manifold.section(across, landscape, sections, axis, color=colour)
             across.set_xlabel(scale.flat_label("e₁, e₂"))
             picture = pictures[i - len(runs)]
             picture.imshow(renders[i][part])
-            error = (
-                "" if photograph is None else f"; here ±{rough(float(np.abs((renders[i] - photograph)[part]).mean()))}"
-            )
+            error = ""
+            if photograph is not None:
+                error = f"; here ±{rough(float(np.abs((renders[i] - photograph)[part]).mean()))}"
             picture.set_title(f"{literal(name)}\n{_score(run, view)}{error}")
             if i == 0:
                 across.set_ylabel(sections.loss_label)
             else:
-                above.colorbar(
-                    filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=list(np.asarray(filled.levels)[1::2])
-                )
+                ticks = list(np.asarray(filled.levels)[1::2])
+                above.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9, ticks=ticks)
         handles = [Line2D([], [], color=colour, label=f"along {name}") for name, colour in ALONG.items()]
         handles.append(Line2D([], [], linestyle="none", label="one training each"))
         figure.set_label(_caption(names, landscapes))
@@ -111,7 +100,7 @@ def most_different(first: np.ndarray, second: np.ndarray) -> tuple[slice, slice]
 def _heading(i: int, runs: Sequence[Path], names: Sequence[str], landscapes: Sequence[Plane]) -> str:
     """The run's step and largest eigenvalue, how many times that of the first run it is, and whether renders doubt it."""
     value, reference = landscapes[i].x.curvature, landscapes[0].x.curvature
-    step, doubt = record_of(runs[i]).data.provenance.iteration, doubt_of(runs[i])
+    step, doubt = manifold.record_of(runs[i]).data.provenance.iteration, manifold.doubt_of(runs[i])
     words = names[i] + (f", step {step:,}" if step else "") + f": λ max {rough(value)}"
     if i and value and reference and np.isfinite([value, reference]).all():
         words += f"\n{rough(value / reference)} times that of {names[0]}"
@@ -156,4 +145,4 @@ def _views(run: Path) -> set[str]:
 
 
 if __name__ == "__main__":
-    program(partial(runs_script, draw, "fig1"))
+    program(partial(manifold.runs_script, draw, "fig1"))

@@ -26,20 +26,12 @@ from matplotlib.ticker import AsinhLocator, FuncFormatter, MaxNLocator, PercentF
 
 from analysis.console.failures import program
 from analysis.records.quantities import BEYOND, BYTES, Shade, percent, quantity, rough
-from analysis.records.run_files import (
-    END_MAPS,
-    VIEW_MAPS,
-    Carrier,
-    MapRecord,
-    Panel,
-    Steepest,
-    Swaps,
-    read_map,
-    read_maps,
-)
+from analysis.records.run_files import Carrier, MapRecord, Panel, Steepest, Swaps, read_map, read_maps
 from figures.scripts import drawn_by, folder_script
 from figures.style import BLACK, RUNS, VERMILION, few_decades, literal, new_figure, round_number, save, style
 
+VIEW_MAPS = ("photograph", "render")  # pictures of a `Panel`, beside the shades of the record
+END_MAPS = ("view", "photograph", "minus", "zero", "plus", "difference")  # those of a `Steepest`
 SAME = 0.02  # greatest difference of curves that look alike, of their axis
 WIDTH, TALLEST = 7.0, 9.0  # inches
 HEAD, LEGEND = 0.35, 0.5  # inches: above a picture, beneath one with a scale
@@ -66,9 +58,8 @@ def show_scaled(axes: Axes, share: UInt8[np.ndarray, "h w"], shade: Shade, title
     """A map in bytes, with its scale beneath, and what that is of."""
     _show(axes, shade.palette[share], title)
     norms = {"log": LogNorm, "signed": partial(AsinhNorm, linear_width=shade.soft), "linear": Normalize}
-    colours = ScalarMappable(
-        norms[shade.scale](vmin=shade.value(shade.low), vmax=shade.value(shade.high)), shade.colours
-    )
+    low, high = shade.value(shade.low), shade.value(shade.high)
+    colours = ScalarMappable(norms[shade.scale](vmin=low, vmax=high), shade.colours)
     figure: Any = axes.figure
     bar = figure.colorbar(
         colours,
@@ -128,9 +119,8 @@ def draw_fragility(maps: dict[str, np.ndarray], index: int, record: MapRecord) -
 def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
     for view, shares in enumerate(swaps.share):
         own = view == index
-        axes.semilogx(
-            swaps.lengths, shares, color=VERMILION if own else "0.75", linewidth=1.4 if own else 0.7, zorder=2 + own
-        )
+        colour, width = (VERMILION, 1.4) if own else ("0.75", 0.7)
+        axes.semilogx(swaps.lengths, shares, color=colour, linewidth=width, zorder=2 + own)
     words = [("this view", VERMILION)] + [("other views", "0.5")] * (len(swaps.share) > 1)
     if len(swaps.share) > 1 and np.ptp(swaps.share, axis=0).max() < SAME:
         words = [(f"all {len(swaps.share)} views coincide", VERMILION)]
@@ -154,9 +144,8 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
         figure, places = _sheet(2, 3, maps["view"].shape[:2], 1)
         axes = dict(zip(("view", "photograph", "zero", "minus", "plus", "difference"), places.flat, strict=True))
         _show(axes["view"], maps["view"], f"Photograph, {end.view.rpartition('/')[2]}")
-        axes["view"].add_patch(
-            Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BLACK, linewidth=1)
-        )
+        frame = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BLACK, linewidth=1)
+        axes["view"].add_patch(frame)
         _show(axes["photograph"], maps["photograph"], f"Gaussians with {share} of {end.name}")
         _show(axes["zero"], maps["zero"], f"Render: loss {quantity(end.losses[1])}")
         _show(axes["minus"], maps["minus"], f"A step back: loss {back}{length}")

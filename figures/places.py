@@ -25,9 +25,8 @@ def draw(record: Record[ProbeRecord]) -> Figure:
         figure = new_figure(3.6)
         panels = figure.subplots(2, 1, sharex=True)
         for axes, other in zip(panels, (1, 2)):
-            dots = axes.scatter(
-                along[:, 0], along[:, other], c=colours, s=3, cmap=FIELD_MAP, norm=scale, plotnonfinite=True
-            )
+            x, y = along[:, 0], along[:, other]
+            dots = axes.scatter(x, y, c=colours, s=3, cmap=FIELD_MAP, norm=scale, plotnonfinite=True)
             for limits, axis in ((axes.set_xlim, 0), (axes.set_ylim, other)):
                 limits(low[axis] - edge[axis], high[axis] + edge[axis])
             axes.set_ylabel(f"axis {other + 1}")

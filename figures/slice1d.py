@@ -97,9 +97,8 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: FiniteProbe) -> None:
     label = "beyond the axis"
     for beyond, edge, marker in ((values < low, low, "v"), (values > high, high, "^")):
         if (beyond & sure).any():
-            axes.plot(
-                steps[beyond & sure], [edge] * (beyond & sure).sum(), marker, color=BLUE, clip_on=False, label=label
-            )
+            there = steps[beyond & sure]
+            axes.plot(there, [edge] * len(there), marker, color=BLUE, clip_on=False, label=label)
             label = None
     axes.set_xlabel(f"step along {along.name}, {along.scale}")
     axes.set_ylabel("curvature (loss per squared step)")

@@ -43,17 +43,15 @@ def draw(record: Record[ProbeRecord]) -> Figure:
     known = "nodes" in arrays
     with style():
         figure = new_figure(6.2 if known else 2.9)
-        *above, last = figure.subplots(
-            3 if known else 1, 1, squeeze=False, height_ratios=[1.4, 1, 1.6] if known else [1]
-        )[:, 0]
+        heights = [1.4, 1, 1.6] if known else [1]
+        *above, last = figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
         _draw_values(last, values, residuals)
         found = _ends(record)
         lines = [f"{name}: {measured(end.value, end.residual)}" for name, end in found.items()]
         last.set_title("\n".join([last.get_title(loc="left"), *lines]), loc="left", linespacing=1.4)
         if known:
-            ends = {
-                name: end.value for name, end in found.items() if end.value is not None and math.isfinite(end.value)
-            }
+            reached = {name: end.value for name, end in found.items() if end.value is not None}
+            ends = {name: value for name, value in reached.items() if math.isfinite(value)}
             draw_on(above[0], arrays["nodes"], arrays["weights"], ends)
             above[0].set_title(_finding(arrays["nodes"], arrays["weights"]), loc="left")
             _draw_distribution(above[1], arrays["nodes"], arrays["weights"])
@@ -128,9 +126,8 @@ def _symmetric_log(axes: Axes, axis: str, values: np.ndarray) -> None:
     threshold = 10.0 ** (top - DECADES)
     getattr(axes, f"set_{axis}scale")("symlog", linthresh=threshold, linscale=0.6)
     negative, positive = np.any(values < 0), np.any(values >= 0)
-    getattr(axes, f"set_{axis}lim")(
-        -(10.0**top) * 1.6 if negative else -threshold, 10.0**top * 1.6 if positive else threshold
-    )
+    low, high = (1.6 * 10.0**top if there else threshold for there in (negative, positive))
+    getattr(axes, f"set_{axis}lim")(-low, high)
     exponents = range(top, top - DECADES, -2)
     ticks = [(0.0, "0")]
     ticks += [(10.0**k, power_of_ten(k)) for k in exponents if positive]

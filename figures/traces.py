@@ -75,10 +75,8 @@ def _title(data: ProbeRecord) -> str:
         return "In no attribute a step changes the loss most for certain"
     first, second, ratio = found
     rendered = "rendered, " if data.step_rises else "by curvature alone, "
-    text = (
-        f"A step in {attribute_name(first)} changes the loss most:\n{rendered}{rough(ratio)} × {attribute_name(second)}"
-    )
-    return f"{text}\n(beside the names: traces, each in its own unit)"
+    text = f"A step in {attribute_name(first)} changes the loss most:\n{rendered}{rough(ratio)} × "
+    return f"{text}{attribute_name(second)}\n(beside the names: traces, each in its own unit)"
 
 
 def _draw_traces(

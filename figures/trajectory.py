@@ -78,9 +78,8 @@ def draw(table: pd.DataFrame) -> Figure:
                 axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center")
         for axes in figure.axes[-2:]:
             axes.set_xlabel("step")
-        figure.suptitle(
-            "\n".join(_happened(*each, measured) for each in methods.items()), fontsize=7.5, x=0.02, ha="left"
-        )
+        title = "\n".join(_happened(*each, measured) for each in methods.items())
+        figure.suptitle(title, fontsize=7.5, x=0.02, ha="left")
         handles = [Line2D([], [], label=literal(name), **look) for name, look in runs.items()]
         handles += marker_words(measured, *PANELS)
         handles.append(Line2D([], [], linestyle="none", label=UNITS))

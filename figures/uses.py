@@ -14,20 +14,7 @@ from analysis.commands.options import GEOMETRY, TWICE
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from figures.scripts import folder_script
-from figures.style import (
-    BLACK,
-    BLUE,
-    FIELD_MAP,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    literal,
-    new_figure,
-    save,
-    style,
-)
+from figures.style import BLUE, FIELD_MAP, GREEN, ORANGE, PURPLE, SKY, VERMILION, literal, new_figure, save, style
 from landscape.errors import InputError
 from splat.model.untrusted import read_arrays, read_table
 
@@ -37,7 +24,7 @@ SCORES = {
     "log_det_11": ("log det, 11 x 11", BLUE),
     "log_det_6": ("log det, 6 x 6 (PUP)", SKY),
     "gn_diagonal": ("Gauss-Newton diagonal", GREEN),
-    "opacity": ("opacity", BLACK),
+    "opacity": ("opacity", "black"),
     "size_opacity": ("size x opacity", PURPLE),
 }
 MEASURES = {"train_psnr": "training views, PSNR (dB)", "test_psnr": "held-out views, PSNR (dB)"}

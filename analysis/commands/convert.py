@@ -91,9 +91,8 @@ def _to_tool(options: ConvertOptions, to: str) -> list[str]:
 
 def _unsaid(back: SplatFile, seen: Seen | None) -> list[str]:
     """A sentence on how the file has to be read, where it does not say so itself.  back: as it is read; seen: as it was."""
-    if seen is None or (
-        back.tool and back.tool in PRESETS and seen.is_that_of(back.tool, antialiased=back.antialiased)
-    ):
+    tool = back.tool or ""
+    if seen is None or (tool in PRESETS and seen.is_that_of(tool, antialiased=back.antialiased)):
         return []
     render = seen.render
     how = f"antialiasing {render.antialias}, blur {render.blur:g}, alpha cap {render.alpha_max:g}, near {render.near:g}"
@@ -124,10 +123,9 @@ def _to_depths(options: ConvertOptions) -> list[str]:
             path = options.out / PurePosixPath(view.name).with_suffix(".npy")
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, content.getvalue())
-    again = TrainOptions(
-        scene.root, images=checkpoint.scene.images, downscale=checkpoint.scene.downscale, method="fsgs"
-    )
-    words = arguments("train", replace(again, depths=options.out, set=("depths=depth",)))
+    made = checkpoint.scene
+    again = TrainOptions(scene.root, images=made.images, downscale=made.downscale, method="fsgs", depths=options.out)
+    words = arguments("train", replace(again, set=("depths=depth",)))
     return [f"depth of {len(views)} views: {shlex.join(['landscape', *words])}", *checkpoint.assumptions]
 
 

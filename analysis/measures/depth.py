@@ -129,19 +129,17 @@ def depth_split(
     for ray, view in zip(rays, objective.linearized, strict=True):
         components.append(along_and_across(view.gradient[objective.blocks["means"]].view(-1, 3), ray))
         for part, gauss_newton in enumerate(parts):
-            sums[:, part] += _split_traces(
-                view.block_diagonal(gauss_newton=gauss_newton, approximate=True).geometry[:, :3, :3], ray
-            ).cpu()
+            blocks = view.block_diagonal(gauss_newton=gauss_newton, approximate=True).geometry
+            sums[:, part] += _split_traces(blocks[:, :3, :3], ray).cpu()
     pairs = torch.stack(components, dim=1).flatten(0, 1)
     dims = (len(objective.active), LATERAL_DIRECTIONS * len(objective.active))
+    found, counts = (sums / len(objective.views)).tolist(), (settings.min_probes, settings.max_probes)
     traces = [
-        SampledTrace(
-            kind, dim, known, pixelwise[0] if pixelwise else None, settings, settings.min_probes, settings.max_probes
-        )
-        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, (sums / len(objective.views)).tolist(), strict=True)
+        SampledTrace(kind, dim, known, pixelwise[0] if pixelwise else None, settings, *counts)
+        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, found, strict=True)
     ]
-    found = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
-    return DepthSplit(pairs[pairs.any(dim=1)], **found)
+    estimates = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
+    return DepthSplit(pairs[pairs.any(dim=1)], **estimates)
 
 
 def depth_rises(

@@ -47,9 +47,8 @@ def needs_of(objective: SceneObjective) -> tuple[int, int]:
     """Estimated bytes of the largest linearised view, and beside the views: of the Gaussians' blocks, a small basis, and a
     product or the pass that computes the blocks.  Renders every view."""
     active, settings = objective.active, objective.settings
-    rasters = (
-        rasterize_view(active, view.camera, objective.background, settings, finite=True) for view in objective.views
-    )
+    cameras, background = (view.camera for view in objective.views), objective.background
+    rasters = (rasterize_view(active, camera, background, settings, finite=True) for camera in cameras)
     view, workspace, sums = max(LinearizedView.size_of(raster, active, settings) for raster in rasters)
     blocks = len(active) * active.flat.element_size() * (GEOMETRY_BLOCK + 3 * (active.sh_degree + 1) ** 2)
     product, making_blocks = workspace + COPIES * active.flat.nbytes, max(sums + blocks, 3 * blocks)
@@ -66,11 +65,8 @@ def expected_peak(objective: SceneObjective) -> int:
     least, camera = view + beside, objective.views[0].camera
     if least > free:
         fit = int(len(objective.active) * free / least)
-        enough = (
-            f"--memory {ceil((used + least) / (1 - SLACK) / 1e7) / 100:g}GB"
-            if is_told()
-            else f"{_size(least - free)} more"
-        )
+        told = f"--memory {ceil((used + least) / (1 - SLACK) / 1e7) / 100:g}GB"
+        enough = told if is_told() else f"{_size(least - free)} more"
         raise TooLittleMemory(
             f"expected at least {_size(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
             f"{camera.width} x {camera.height} px, got {_size(used + free)}, {_size(used)} of them taken; "

@@ -27,18 +27,11 @@ from analysis.measures.units import Metric, optimiser_units
 from analysis.records import schema
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord
-from landscape import (
-    BlockAnisotropy,
-    BlockAnisotropySettings,
-    Bracket,
-    RestrictedOperator,
-    ScaledOperator,
-    block_anisotropy,
-)
+from landscape import BlockAnisotropy, BlockAnisotropySettings, RestrictedOperator, ScaledOperator, block_anisotropy
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.probes import spawn
-from landscape.results import Progress, finite_or_none
+from landscape.results import Bracket, Progress, finite_or_none
 from landscape.spectrum.block_anisotropy import WHOLE
 from landscape.traces.trace import total_trace
 from splat.curvature.block_eigenvectors import BlockEigenvectors
@@ -113,13 +106,10 @@ class FamilyFindings:
         """The record of a probe with the families, the effects of the split, and notes on what was left out."""
         families, control = [row.record(self.metric, self.unit) for row in self.rows], UNSET
         if split := self.control:
-            psnr = split.psnr if split.rms else None
-            control = schema.SplitControl(
-                gaussians=len(split.gaussians), rms=split.rms, psnr=psnr, effects=list(self.effects)
-            )
-        return structs.replace(
-            record, per_attribute=families, split_control=control, notes=[*record.notes, *self.notes]
-        )
+            about = {"rms": split.rms, "psnr": split.psnr if split.rms else None, "effects": list(self.effects)}
+            control = schema.SplitControl(gaussians=len(split.gaussians), **about)
+        notes = [*record.notes, *self.notes]
+        return structs.replace(record, per_attribute=families, split_control=control, notes=notes)
 
 
 def measure_per_attribute(

@@ -230,9 +230,8 @@ def crop_around(outlines: Sequence[Sequence[float]], width: int, height: int) ->
     turn, radius = np.meshgrid(np.linspace(0, 2 * np.pi, 181), np.linspace(0, 1, 51))
     x, y, long, short, angle = np.array(outlines).T[:, :, None, None]
     along, across = long * radius * np.cos(turn), short * radius * np.sin(turn)
-    points = np.stack(
-        [x + along * np.cos(angle) - across * np.sin(angle), y + along * np.sin(angle) + across * np.cos(angle)]
-    )
+    c, s = np.cos(angle), np.sin(angle)
+    points = np.stack([x + along * c - across * s, y + along * s + across * c])
     size = np.array([width, height])[:, None, None, None]
     inside = points[:, ((points >= 0) & (points <= size)).all(axis=0)]
     ends = inside if inside.size else np.array(outlines)[:1, :2].T  # none inside: the first centre

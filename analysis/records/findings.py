@@ -82,9 +82,8 @@ def _of_traces(traces: Mapping[str, schema.Trace]) -> list[Line]:
     ]
     signs = {"negative": "negative: on average the loss curves down there", "undetermined": "not decided by its error"}
     for sign, words in signs.items():
-        if named := [
-            attribute_name(n) for n, trace in traces.items() if trace.sign == sign and _is_finite(trace.value)
-        ]:
+        those = [name for name, trace in traces.items() if trace.sign == sign and _is_finite(trace.value)]
+        if named := [*map(attribute_name, those)]:
             lines.append(Line(f"The sign of the trace of {' and '.join(named)} is {words}.", "caution"))
     return lines
 

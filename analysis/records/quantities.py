@@ -138,6 +138,15 @@ def limits(low: float | None, high: float | None) -> str:
     return " … ".join(dict.fromkeys((quantity(low), quantity(high))))
 
 
+def folded(text: str, width: int) -> str:
+    """Numbers as text, broken in two at ± or … where they are wider than this.
+
+    >>> folded("7.45 × 10⁻⁴ … 1.02 × 10⁴", 15), folded("34.1 … 120", 15)
+    ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
+    """
+    return text if len(text) <= width else text.replace(PLUS_MINUS, f"\n±{HARD}").replace(" … ", " …\n")
+
+
 def power_of_ten(exponent: int) -> str:
     """10 to this power, in superscript digits.
 

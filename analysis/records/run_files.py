@@ -1,7 +1,7 @@
 """The files beside a run's checkpoint: their names, their layout, and how they are read.
 
     RUN/metrics.json      Scores, written by `analysis/train/command.py`
-    RUN/seconds.json      Seconds, written by `analysis/train/training_time.py`
+    RUN/seconds.json      Seconds, written by `analysis/train/progress.py`
     RUN/trajectory.csv    a row for each record along the training, written by `analysis/train/trajectory.py`
     RUN/map/map.json      MapRecord, written by `landscape map`
     OUT/compare.json      Comparison, written by `landscape compare`
@@ -44,8 +44,6 @@ NUMBERS = (  # more of them, empty where not determined; others may be there too
     *(f"{name}{part}" for name in ENDS for part in ("", "_error")),
     *(f"{name}{part}" for name in TRAJECTORY_INDICES for part in ("", "_low", "_high")),
 )
-VIEW_MAPS = ("photograph", "render")  # pictures of a `Panel`, beside the shades of the record
-END_MAPS = ("view", "photograph", "minus", "zero", "plus", "difference")  # those of a `Steepest`
 FileName = Annotated[str, Meta(pattern=NAME)]  # without its suffix
 _TRAJECTORY = "the records of landscape train --probe-every"
 

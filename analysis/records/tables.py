@@ -10,17 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from analysis.records.findings import attribute_name, is_open, is_wide
-from analysis.records.quantities import (
-    HARD,
-    PLUS_MINUS,
-    UNDETERMINED,
-    apart,
-    limits,
-    measured,
-    percent,
-    quantity,
-    rough,
-)
+from analysis.records.quantities import UNDETERMINED, apart, folded, limits, measured, percent, quantity, rough
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import INDICES, BlockAnisotropy, Depth, Effect, End, Index, Number
 
@@ -76,9 +66,8 @@ def _end_rows(data: ProbeRecord) -> Iterator[Row]:
     for name, end in data.eigenvalues.items():
         shares = ", ".join(f"{share:.0%} {attribute_name(of)}" for of, share in end.shares.items() if share >= LEAST)
         value, made = measured(end.value, end.residual), f"{end.matvecs} products" if end.matvecs else ""
-        about = (
-            f"{', '.join(filter(None, (shares, end.method, made)))}{_reason(end.reason)}{_of_views(end.views_error)}"
-        )
+        known = ", ".join(filter(None, (shares, end.method, made)))
+        about = f"{known}{_reason(end.reason)}{_of_views(end.views_error)}"
         if not end.is_reached:
             value, about = UNDETERMINED, f"at {value} so far; {about}"
         yield ENDS[name], value, about
@@ -130,10 +119,8 @@ def _depth_rows(depth: Depth | None) -> Iterator[Row]:
     for kind, trace in depth.curvature.items():
         yield f"trace of curvature, {kind}", measured(trace.value, trace.standard_error), f"dim {trace.dim:,}"
     for row in depth.rises:
-        rises = (
-            f"{measured(row.depth, row.depth_error)} over {measured(row.lateral, row.lateral_error)}; order changed in "
-        )
-        rises += f"{row.depth_crossed:.0%} and {row.lateral_crossed:.0%} of the renders"
+        rises = f"{measured(row.depth, row.depth_error)} over {measured(row.lateral, row.lateral_error)}"
+        rises += f"; order changed in {row.depth_crossed:.0%} and {row.lateral_crossed:.0%} of the renders"
         yield f"depth / lateral rise, {row.pixels:g} px", measured(row.ratio, row.ratio_error), rises
 
 
@@ -219,18 +206,9 @@ def family_table(data: ProbeRecord) -> Table:
             table.add_row(operator := line.operator, style="bold")
         label = line.block if line.scene in ("", "trained") else f"  {line.scene}"
         cells = [line.indices[i] for i in shown]
-        texts = ("\n".join(_folded(text) for text in (c.value, c.bracket) if text) for c in cells)
+        texts = ("\n".join(folded(text, WIDTH) for text in (c.value, c.bracket) if text) for c in cells)
         table.add_row(escape(label), *texts)
     return table
-
-
-def _folded(text: str) -> str:
-    """Text, broken in two at ± or … where it is wider than a column.
-
-    >>> _folded("7.45 × 10⁻⁴ … 1.02 × 10⁴"), _folded("34.1 … 120")
-    ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
-    """
-    return text if len(text) <= WIDTH else text.replace(PLUS_MINUS, f"\n±{HARD}").replace(" … ", " …\n")
 
 
 def bracketed(index: Index | None) -> Cell:
@@ -238,7 +216,7 @@ def bracketed(index: Index | None) -> Cell:
 
     >>> bracketed(Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")).value
     '≥ 34.2'
-    >>> print(bracketed(Index(value=2.0, low=1.95, high=2.04, note="")).value.replace(HARD, " "))
+    >>> print(bracketed(Index(value=2.0, low=1.95, high=2.04, note="")).value.replace("\N{NO-BREAK SPACE}", " "))
     2.00 ± 0.05
     >>> bracketed(Index(value=2.0, low=1.0, high=30.0, note=""))
     Cell(value='–', bracket='1.00 … 30.0', note='')

@@ -74,16 +74,9 @@ def run_compare(options: CompareOptions) -> int:
     ]
     for path in missing:
         probe(path, options, loss)
-    runs = [
-        Run(
-            path,
-            label,
-            checkpoint,
-            scores_of(path, checkpoint, notes),
-            read_record(probe_folder(path), ProbeRecord).data,
-        )
-        for path, label, checkpoint in zip(paths, labels, checkpoints)
-    ]
+    records = [read_record(probe_folder(path), ProbeRecord).data for path in paths]
+    scores = [scores_of(path, checkpoint, notes) for path, checkpoint in zip(paths, checkpoints)]
+    runs = [Run(*each) for each in zip(paths, labels, checkpoints, scores, records)]
     losses = {run.label: run.data.objective.loss for run in runs}
     require_alike("loss", losses, "probe all of them with --loss 3dgs")
     named = [replace(group, label=os.path.relpath(Path(group.label).resolve(), common)) for group in groups]
@@ -186,9 +179,8 @@ def split_controls(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         if control := run.data.split_control:
             seen = next((row.gaussians for row in run.data.per_attribute or () if row.split), control.gaussians)
-            lost = (
-                f", and {control.gaussians - seen:,} of the halves touch no pixel." if seen < control.gaussians else "."
-            )
+            gone = control.gaussians - seen
+            lost = f", and {gone:,} of the halves touch no pixel." if gone > 0 else "."
             lines.append(
                 f"{run.label}: the split into {control.gaussians:,} halves changes the images by {quantity(control.rms)} "
                 f"(root mean square; {quantity(control.psnr)} dB){lost}"
@@ -249,9 +241,8 @@ def render_page(
 ) -> str:
     """The page as text, with the pictures that lie in the folder.  groups: of the rows' columns."""
     environment = template_environment()
-    sections = {
-        name: [row for row in rows if row.section == name] for name in dict.fromkeys(row.section for row in rows)
-    }
+    names = dict.fromkeys(row.section for row in rows)
+    sections = {name: [row for row in rows if row.section == name] for name in names}
     return environment.get_template("compare.html.jinja").render(
         runs=runs,
         headings=headings(groups),

@@ -39,9 +39,8 @@ def groups_of(runs: Sequence[Path]) -> list[Group]:
     """A group for each run, and for each folder whose sub-folders are runs (a sweep's OUT/SCENE/METHOD)."""
     groups = []
     for path in runs:
-        seeds = (
-            sorted(found.parent for found in path.glob(f"*/{CHECKPOINT}")) if not (path / CHECKPOINT).is_file() else []
-        )
+        alone = (path / CHECKPOINT).is_file()
+        seeds = [] if alone else sorted(found.parent for found in path.glob(f"*/{CHECKPOINT}"))
         groups.append(Group(str(path), tuple(seeds or [path])))
     return groups
 
@@ -72,9 +71,8 @@ def grouped(rows: Sequence[Row], groups: Sequence[Group]) -> list[Row]:
 def _together(entries: Sequence[Entry]) -> Entry:
     """One run as it is; of several mean and spread of the numbers, the text that all have, or all texts."""
     first = entries[0]
-    if all(entry.value == first.value for entry in entries) and (
-        len(entries) == 1 or not isinstance(first.value, float)
-    ):
+    alike = len(entries) == 1 or not isinstance(first.value, float)
+    if alike and all(entry.value == first.value for entry in entries):
         return first
     numbers = [entry.value for entry in entries if isinstance(entry.value, int | float) and isfinite(entry.value)]
     if not numbers:
@@ -161,9 +159,8 @@ def _uneven(rows: Sequence[Row], i: int) -> str:
     if max(here, there) <= EQUAL * min(here, there) or any(row[i].value and row[0].value for row in split):
         return ""
     numbers = " and ".join(counts[0][j].cell.value for j in (i, 0))
-    return (
-        f"they have {numbers} Gaussians, and their number alone changes the indices: --split-control measures how much"
-    )
+    told = "their number alone changes the indices: --split-control measures how much"
+    return f"they have {numbers} Gaussians, and {told}"
 
 
 def _apart(here: Entry, there: Entry) -> bool:

@@ -252,9 +252,8 @@ def found_before(
         none = torch.zeros(0, dtype=torch.float64)
         return none, none, torch.zeros(operator.dim, 0, dtype=operator.dtype, device=device), 0.0
     pairs = (ends.largest,) if ends.smallest is ends.largest else (ends.largest, ends.smallest)
-    values, residuals, errors = (
-        torch.cat([getattr(pair, name) for pair in pairs]) for name in ("values", "residuals", "vector_errors")
-    )
+    names = "values", "residuals", "vector_errors"
+    values, residuals, errors = (torch.cat([getattr(pair, name) for pair in pairs]) for name in names)
     good = (errors < FOUND) & (residuals <= CLOSE * values.abs())
     vectors = torch.cat([pair.vectors for pair in pairs], dim=1)[:, good.to(ends.largest.vectors.device)]
     return values[good], residuals[good], torch.linalg.qr(vectors).Q, float(errors[good].max()) if good.any() else 0.0

@@ -95,9 +95,8 @@ class SceneObjective:
         # products give the same bits each time, even where the training's steps do not
         self.settings = replace(settings, accumulation="deterministic")
         self.background = background_of(gaussians, background)
-        self._losses = [
-            backend_of(gaussians.flat).view_loss(view.image, loss_settings, gaussians.flat) for view in views
-        ]
+        backend, like = backend_of(gaussians.flat), gaussians.flat
+        self._losses = [backend.view_loss(view.image, loss_settings, like) for view in views]
         used = gaussians.select(torch.arange(len(gaussians)), degree)
         seen = used.flat.new_zeros(len(used), dtype=torch.bool)
         for view in views:

@@ -167,9 +167,8 @@ def explicit_split(names: Sequence[str], train: Sequence[str], test: Sequence[st
     chosen = tuple(_resolve(names, key) for key in train)
     if not chosen or len(set(chosen)) < len(chosen):
         raise InputError(f"expected training views, each once, got {list(train)}")
-    held_out = (
-        tuple(name for name in names if name not in chosen) if test is None else tuple(_resolve(names, k) for k in test)
-    )
+    others = [name for name in names if name not in chosen]
+    held_out = tuple(others if test is None else (_resolve(names, key) for key in test))
     both = sorted(set(chosen) & set(held_out))
     if both:
         raise InputError(f"expected test views that do not train, got {both[0]!r} in both lists")
@@ -191,9 +190,8 @@ def read_names(path: Path) -> tuple[str, ...]:
 def _resolve(names: Sequence[str], key: str) -> str:
     if key in names:
         return key
-    matches = [
-        name for name in names if key in (name.rsplit("/", 1)[-1], re.sub(r"\.\w+$", "", name.rsplit("/", 1)[-1]))
-    ]
+    last = {name: name.rsplit("/", 1)[-1] for name in names}
+    matches = [name for name, part in last.items() if key in (part, re.sub(r"\.\w+$", "", part))]
     if len(matches) != 1:
         problem = f"{len(matches)} views have it: {', '.join(matches[:3])}" if matches else "no view has it"
         raise InputError(

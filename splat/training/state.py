@@ -303,10 +303,9 @@ class Training(ShortRepr):
 
     def move(self, device: torch.device) -> None:
         """Continue on another device; the generator stays on the CPU, so that it draws the same numbers everywhere."""
-        gradients = self.screen_gradients
-        self.gaussians = self.gaussians.with_flat(self.gaussians.flat.to(device))
-        self.adam.first, self.adam.second = (
-            moment.with_flat(moment.flat.to(device)) for moment in (self.adam.first, self.adam.second)
+        gradients, adam = self.screen_gradients, self.adam
+        self.gaussians, adam.first, adam.second = (
+            each.with_flat(each.flat.to(device)) for each in (self.gaussians, adam.first, adam.second)
         )
         self.screen_gradients = ScreenGradients(gradients.total.to(device), gradients.renders.to(device))
 

@@ -118,10 +118,8 @@ def checkpoint_case(path: Path, out: Path) -> Case:
     """The case of a checkpoint; its truth is read from OUT/truth.json, or computed and written there."""
     if not path.is_file():
         raise FileNotFoundError(f"expected a checkpoint as written by `landscape train`, got no file {path}")
-    workload = workload_of(path)
-    objective = SceneObjective(
-        workload.gaussians, workload.views, workload.loss, workload.background, workload.settings
-    )
+    of = workload_of(path)
+    objective = SceneObjective(of.gaussians, of.views, of.loss, of.background, of.settings)
     hessian = SceneHessian(objective)
     key = {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "dim": hessian.dim}
     stored = out / TRUTH
@@ -130,7 +128,7 @@ def checkpoint_case(path: Path, out: Path) -> Case:
         kept = {"of": key, "truth": asdict(_truth(objective, hessian))}
         write_atomically(stored, json.dumps(kept, indent=1).encode())
     active = ActiveSpace(hessian.project, hessian.rank)
-    return Case(workload.name, "checkpoint", hessian, Truth(**kept["truth"]), None, objective, active)
+    return Case(of.name, "checkpoint", hessian, Truth(**kept["truth"]), None, objective, active)
 
 
 def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:

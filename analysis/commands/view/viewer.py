@@ -94,9 +94,8 @@ class Viewer:
         active = objective.active
         self.plain = (0.5 + Y00 * active.sh[:, 0]).clamp(0, 1).float().numpy()
         self.opacities = baked(active).opacity_logits.sigmoid().float().numpy()[:, None]
-        self.splats = server.scene.add_gaussian_splats(
-            "/splats", **self.frame.splats(active), rgbs=self.plain, opacities=self.opacities
-        )
+        look: dict[str, Any] = {"rgbs": self.plain, "opacities": self.opacities}
+        self.splats = server.scene.add_gaussian_splats("/splats", **self.frame.splats(active), **look)
         self.mark = server.scene.add_frame("/picked", show_axes=False, visible=False)
         self._add_cameras(start)
         gui = server.gui

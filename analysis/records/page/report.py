@@ -155,9 +155,8 @@ def _page(record: Record[ProbeRecord], mapped: MapRecord | None, said: list[Line
         indices=INDICES,
     )
     shown = html.unescape(re.sub(r"<(style|script)>.*?</\1>|<[^>]*>", " ", text, flags=re.DOTALL))
-    used = [
-        f"<dt>{term}</dt><dd>{words}</dd>" for term, words in GLOSSARY.items() if re.search(rf"(?<!\w){term}", shown)
-    ]
+    terms = [term for term in GLOSSARY if re.search(rf"(?<!\w){term}", shown)]
+    used = [f"<dt>{term}</dt><dd>{GLOSSARY[term]}</dd>" for term in terms]
     return text.replace('<dl id="glossary">', "\n".join(['<dl id="glossary">', *used]), 1)
 
 
@@ -252,9 +251,8 @@ def map_pictures(folder: Path, mapped: MapRecord | None) -> list[dict[str, str]]
     """Pictures of the map in a folder: "uri", "words", the "text" above and the "caption" below each."""
     if mapped is None:
         return []
-    rows = [
-        (end.file, f"{end.sentence} {end.rendered}", end.sentence, carriers_in_words(end)) for end in mapped.steepest
-    ]
+    ends = mapped.steepest
+    rows = [(end.file, f"{end.sentence} {end.rendered}", end.sentence, carriers_in_words(end)) for end in ends]
     fragile, named = "\n".join(mapped.sentences[len(mapped.steepest) :]), {end.view for end in mapped.steepest[:1]}
     panel = next((panel for panel in mapped.panels if panel.name in named), mapped.panels[0] if mapped.panels else None)
     words = f"{panel.name}: maps of its fragility in position, conditioning and opacity. {PIXEL}" if panel else ""

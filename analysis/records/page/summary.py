@@ -53,9 +53,8 @@ def _of_one(text: str) -> str:
 
 def _doubtful(data: ProbeRecord) -> list[str]:
     """Checks of the derivatives that failed; round-off is an error that numbers have, and leaves them their meaning."""
-    return [
-        name.replace("_", " ") for name, check in data.checks.items() if check.passed is False and name != "round_off"
-    ]
+    failed = [name for name, check in data.checks.items() if check.passed is False and name != "round_off"]
+    return [name.replace("_", " ") for name in failed]
 
 
 def steps_made(steps: int, foreign: bool) -> str:

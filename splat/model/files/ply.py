@@ -220,8 +220,7 @@ def ply_bytes(
         rows, size = [], dtype.itemsize
         for i in range(len(numbers)):
             rows.append(body[i * size : (i + 1) * size])
-            rows += [
-                np.uint32(len(each[i])).tobytes() + np.asarray(each[i], "<i4").tobytes() for each in lists.values()
-            ]
+            for each in lists.values():
+                rows += [np.uint32(len(each[i])).tobytes(), np.asarray(each[i], "<i4").tobytes()]
         body = b"".join(rows)
     return "\n".join([*header, "end_header\n"]).encode() + body

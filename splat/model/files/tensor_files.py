@@ -244,19 +244,11 @@ def gsplat_bytes(
         "sh0": values["sh"][:, :1].clone(),
         "shN": values["sh"][:, 1:].clone(),
     }
-    content: dict[str, Any] = {"step": step, "splats": splats}
-    if extra:
-        content["extra"] = {name: torch.from_numpy(np.array(column, np.float32)) for name, column in extra.items()}
-    if tool:
-        content["trained_by"] = tool
-    if antialiased:
-        content["antialiased"] = True
-    if train:
-        content["training_views"] = list(train)
-    if width:
-        content["training_width"] = width
+    columns = {name: torch.from_numpy(np.array(column, np.float32)) for name, column in (extra or {}).items()}
+    said = {"extra": columns, "trained_by": tool, "antialiased": antialiased, "training_views": list(train)}
+    said["training_width"] = width
     buffer = io.BytesIO()
-    torch.save(content, buffer)
+    torch.save({"step": step, "splats": splats} | {name: each for name, each in said.items() if each}, buffer)
     return buffer.getvalue()
 
 
@@ -266,10 +258,8 @@ def _splatfacto(content: Mapping[str, Any]) -> SplatFile:
     prefix = next((found[1] for name in names if (found := NERFSTUDIO.fullmatch(name))), None)
     if prefix is None:
         raise InputError("its pipeline has no Gaussians; expected a checkpoint of splatfacto")
-    constant, rest = (
-        _array(state, f"{prefix}features_dc", None, 3),
-        _array(state, f"{prefix}features_rest", None, None, 3),
-    )
+    constant = _array(state, f"{prefix}features_dc", None, 3)
+    rest = _array(state, f"{prefix}features_rest", None, None, 3)
     logits, notes = finite_logits(_array(state, f"{prefix}opacities", None, 1)[:, 0])
     if moved := [
         name for name in names if MOVED.search(name) and isinstance(state[name], Tensor) and state[name].any()

@@ -171,12 +171,9 @@ def _photos(
             continue
         rotation, centre = _pose(frame["transform_matrix"], name, path)
         lens = _lens({**shared, **frame}, image_header(image)[0], name, path)
-        mask = _file(frame, "mask_path", path)
-        photos.append(
-            Photo(
-                name, image, lens, rotation, centre, subsets.get(name), mask=inside(path.parent, mask) if mask else None
-            )
-        )
+        named = _file(frame, "mask_path", path)
+        mask = inside(path.parent, named) if named else None
+        photos.append(Photo(name, image, lens, rotation, centre, subsets.get(name), mask=mask))
     return photos, skipped
 
 

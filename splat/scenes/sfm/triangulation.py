@@ -95,10 +95,8 @@ def _add(model: pycolmap.Reconstruction, camera: Camera, number: int) -> str:
 
 
 def _lens(camera: Camera, camera_id: int) -> pycolmap.Camera:
-    params = [camera.fx, camera.fy, camera.cx, camera.cy]
-    lens = pycolmap.Camera(
-        camera_id=camera_id, model="PINHOLE", width=camera.width, height=camera.height, params=params
-    )
+    size, params = {"width": camera.width, "height": camera.height}, [camera.fx, camera.fy, camera.cx, camera.cy]
+    lens = pycolmap.Camera(camera_id=camera_id, model="PINHOLE", **size, params=params)
     lens.has_prior_focal_length = True  # known, so that pairs are verified with essential matrices
     return lens
 
