@@ -33,7 +33,7 @@ from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import ProductCheck, check_against_gradient
 from analysis.measures.localization import masses, participation
 from analysis.measures.memory import basis_within, vectors_within
-from analysis.measures.steepest import heaviest, kink_curvature
+from analysis.measures.steepest import LossNearby, heaviest, kink_curvature
 from analysis.measures.units import step_rises
 from analysis.probe.measured import LeftOut, Measured, PlaneSlice, Rendered, Search, Spectrum
 from analysis.probe.plan import MOST_AT_ONCE
@@ -290,8 +290,10 @@ def _plane(
 ) -> PlaneSlice | None:
     center = at.objective.active.flat
     workers = thread_count() if backend_of(center) is CPU else 1
-    loss = evaluation(at.objective, workers)
-    return plane_of(loss, center, at.value, at.gradient, ends, at.settings, workers, generator, report, notes)
+    loss = evaluation(at.objective.evaluate, workers)
+    return plane_of(
+        loss, center, at.value, at.gradient, ends, at.settings, workers, generator, report, notes, at.objective
+    )
 
 
 def plane_of(
@@ -305,8 +307,12 @@ def plane_of(
     generator: torch.Generator,
     report: Progress,
     notes: list[str],
+    objective: SceneObjective | None = None,
 ) -> PlaneSlice | None:
-    """The loss over the plane of the first two eigenvectors; None where a note says why.  value, gradient: at center."""
+    """The loss over the plane of the first two eigenvectors; None where a note says why.  value, gradient: at center.
+
+    objective: where the loss is that of one, so that it may be rendered in parts of its views (`LossNearby`).
+    """
     loss_scale, curvatures = settings.slice_rise * value, ends.largest.values[:2]
     if loss_scale <= 0 or not curvatures.all():
         notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")
@@ -316,13 +322,18 @@ def plane_of(
     vectors = ends.largest.vectors[:, :2]
     most = inf if settings.slice_plane else 1  # 1: the two axes alone
     accuracy = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most)
+    nearby = None
+    if objective is not None and settings.slice_plane:
+        ends_of_axes = [center + vectors @ center.new_tensor([x, y]) for x in axes[0][[0, -1]] for y in axes[1][[0, -1]]]
+        nearby = LossNearby.of(objective, vectors, ends_of_axes)
     # E^T H E of Ritz vectors E is diagonal: no product is needed
     plane = evaluate_slice(
-        loss, center, vectors, axes, gradient, curvatures.diag(), accuracy, generator, progress=report
-    )
+        loss, center, vectors, axes, gradient, curvatures.diag(), accuracy, generator, progress=report,
+        control=nearby and evaluation(nearby, workers),
+    )  # fmt: skip
     return PlaneSlice(plane, loss_scale, (first, second))
 
 
-def evaluation(objective: SceneObjective, workers: int) -> Loss:
-    """The objective as a function for this number of threads; called from one alone, its kernels use all processors."""
-    return objective.evaluate if workers == 1 else single_threaded()(objective.evaluate)
+def evaluation(loss: Loss, workers: int) -> Loss:
+    """The loss as a function for this number of threads; called from one alone, its kernels use all processors."""
+    return loss if workers == 1 else single_threaded()(loss)

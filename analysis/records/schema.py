@@ -369,7 +369,7 @@ class Slice(Struct, kw_only=True):
     """The loss along a line or over a plane through the checkpoint.
 
     center_loss: L at the centre, rendered with the slice.  points, evaluated_points, crossed_points: of the grid, see ARRAYS;
-    evaluations: renders of all views.  Errors are shares of the range of the evaluated losses.  tolerance: asked of
+    evaluations: renders of all views.  Errors are shares of the range of the losses.  tolerance: asked of
     interpolated points; None where all are evaluated.  resolved: whether it was reached; else only evaluated points have a
     loss.  interpolation_error: bound at every interpolated point (`landscape.slices.interpolation`); 0 where all are evaluated,
     None where there is no bound.  error_seen: the largest at `holdout_points` random points.  reason: as for `Trace`.

@@ -191,7 +191,7 @@ def _measure(
 
 def _evaluation(objective: SceneObjective, workers: int) -> Loss:
     """`evaluation`, whose InputError says that the step is too long."""
-    inner = evaluation(objective, workers)
+    inner = evaluation(objective.evaluate, workers)
 
     def evaluate(flat: Tensor) -> Evaluation:
         try:

@@ -30,7 +30,8 @@ DIGITS = 9  # of distances: points that are as far but for round-off are taken i
 class PlaneInterpolant:
     """The interpolant on a grid x times y that has 0 in both.  Points are numbered as in the flattened grid.
 
-    axes: the points of both axes.  mixed: a.
+    axes: the points of both axes.  mixed: a.  through_axes: False for the spline of f itself, through the points that are
+    known wherever they lie, of which the centre alone is needed (`axes`).
 
     >>> x = np.linspace(-1, 1, 9)
     >>> grid, f = PlaneInterpolant(x, x, mixed=0.5), (x[:, None] ** 2 + x * x[:, None] * (0.5 + x)).ravel()
@@ -40,11 +41,13 @@ class PlaneInterpolant:
     (33, True)
     """
 
-    def __init__(self, x: np.ndarray, y: np.ndarray, mixed: float | None = None):
-        self._x, self._y, self._mixed = x, y, mixed
+    def __init__(self, x: np.ndarray, y: np.ndarray, mixed: float | None = None, through_axes: bool = True):
+        self._x, self._y, self._mixed, self._through_axes = x, y, mixed, through_axes
         self._i, self._j = (int(np.flatnonzero(axis == 0)[0]) for axis in (x, y))
         number = np.arange(len(x) * len(y)).reshape(len(x), len(y))
         self.axes = np.unique(np.concatenate([number[:, self._j], number[self._i]]))
+        if not through_axes:
+            self.axes = number[self._i, [self._j]]
         places = np.meshgrid(*(axis / np.abs(axis).max() for axis in (x, y)), indexing="ij")
         self._places = np.stack(places, axis=-1).reshape(-1, 2)
 
@@ -63,18 +66,20 @@ class PlaneInterpolant:
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Interpolation at all points, from values [points], nan where not known.  nan where the axes have no finite value."""
         f = values.reshape(len(self._x), len(self._y))
+        if not self._through_axes:
+            return self._spline(f, np.isfinite(f)).ravel()
         along = f[:, [self._j]] + f[[self._i]] - f[self._i, self._j]
         products = np.outer(self._x, self._y)
         with np.errstate(divide="ignore", invalid="ignore"):
             r = (f - along) / products - (self._mixed or 0.0)
-        return (along + products * ((self._mixed or 0.0) + self._spline(r))).ravel()
-
-    def _spline(self, r: np.ndarray) -> np.ndarray:
-        """r everywhere, from where it is finite; 0 where it is known nowhere."""
         known = np.isfinite(r)
         known[self._i, :] = known[:, self._j] = False  # 0 / 0
         if self._mixed is not None:
             r[self._i, self._j], known[self._i, self._j] = 0.0, True
+        return (along + products * ((self._mixed or 0.0) + self._spline(r, known))).ravel()
+
+    def _spline(self, r: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """r everywhere, from where it is known; 0 where that is nowhere."""
         if known.sum() < FEWEST_NODES:
             return np.zeros_like(r)
         spline = scipy.interpolate.RBFInterpolator(self._places[known.ravel()], r[known], kernel="cubic")

@@ -9,6 +9,11 @@
 bound: `interpolation.error_bound`, of the error at every point not known, from the errors at the points held out; the k-th
 hold-out may err with a chance of 5% / 2^k.  range: largest less smallest of the values evaluated.
 
+control: a function that is cheap and differs from the loss by little that is smooth.  It is then refined first, in the same
+way, to half the tolerance.  Of the loss itself COARSE / 2 points and the centre are evaluated at first, none for the axes' sake,
+and half a hold-out: the spline through its differences from the control predicts the others.  Both bounds are added.  Where
+it is that of the control which is too wide, the control is evaluated everywhere.
+
 A slice keeps the interpolant that was judged.  Fitting it again with the points held out made it worse in 95% of the draws on
 a fern's planes: some lie next to an axis, where its spline, divided by x y, magnifies jumps.  A plane whose bound is not
 within the tolerance at max_evaluations is not resolved: its points are those that were evaluated.  Decisions are made when
@@ -63,41 +68,57 @@ class Refined:
     """Outcome of a refinement.
 
     values [points]: evaluated or interpolated, nan where neither.  holdout: |prediction - value| at the points of the last
-    hold-out, none where every point was evaluated.  looks: number of hold-outs.  reason: why it ended.
+    hold-out, none where every point was evaluated.  looks: number of hold-outs.  reason: why it ended.  bound: of the error at
+    every point that was not evaluated.
     """
 
     values: np.ndarray
     holdout: np.ndarray
     looks: int
     reason: StopReason
+    bound: float = 0.0
 
 
 def evaluate_adaptively(
-    evaluations: GridEvaluations, grid: PlaneInterpolant, settings: SliceSettings, generator: torch.Generator
+    evaluations: GridEvaluations,
+    grid: PlaneInterpolant,
+    settings: SliceSettings,
+    generator: torch.Generator,
+    control: tuple[GridEvaluations, Refined] | None = None,
 ) -> Refined:
     """Evaluate in rounds until the others are predicted within the tolerance, or all are known; the axes in any case.
 
-    A round that does not fit into max_evaluations is not begun.
+    A round that does not fit into max_evaluations is not begun.  control: evaluated and refined on the same grid.
     """
     assert settings.tolerance is not None
-    errors, looks, fill = np.empty(0), 0, COARSE
+    halves = 1 if control is None else 2
+    errors, looks, fill, bound = np.empty(0), 0, COARSE // halves, inf
     evaluations.require(grid.axes)
     while not (known := evaluations.known).all():  # `require` sets entries of this array
         filling = grid.farthest(known, fill)
-        drawn = _draw(known, filling, max(settings.holdout, fill), generator)
+        drawn = _draw(known, filling, max(settings.holdout // halves, fill), generator)
         # 1: the loss at the centre, which is evaluated apart from the grid's points
         if 1 + int(known.sum()) + len(filling) + len(drawn) > settings.max_evaluations:
-            return Refined(evaluations.value, errors, looks, "evaluation budget")
+            return Refined(evaluations.value, errors, looks, "evaluation budget", bound)
         evaluations.require(filling)
-        predicted = grid(evaluations.value)
+        exact, beside, others = 0.0, 0.0, 0.0  # the control: evaluated, refined, and its bound
+        if control is not None:
+            control[0].require([*np.flatnonzero(known), *drawn])
+            exact, beside, others = control[0].value, control[1].values, control[1].bound
+        predicted = grid(evaluations.value - exact)
         evaluations.require(drawn)
-        errors, looks = np.abs(predicted - evaluations.value)[drawn], looks + 1
+        errors, looks = np.abs(predicted + exact - evaluations.value)[drawn], looks + 1
         fill = 3 * int(known.sum() - len(grid.axes)) // 4
         errors[~np.isfinite(errors)] = inf  # without a number no bound holds
+        allowed = settings.tolerance * value_range(evaluations.value)
         bound = error_bound(errors, int((~known).sum()), looks)
-        if bound <= settings.tolerance * value_range(evaluations.value) and not known.all():
-            values = np.where(known, evaluations.value, predicted)
-            return Refined(values, errors, looks, "tolerance")
+        if control is not None and allowed - others < bound <= allowed:
+            control[0].require(range(len(known)))
+            beside, others = exact, 0.0
+        bound += others
+        if bound <= allowed and not known.all():
+            values = np.where(known, evaluations.value, predicted + beside)
+            return Refined(values, errors, looks, "tolerance", bound)
     return Refined(evaluations.value, np.empty(0), looks, "exact")
 
 

@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from landscape.results import StopReason, plain
-from landscape.slices.interpolation import error_bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +25,8 @@ class Slice:
     discontinuous: evaluated points on another smooth piece than the centre (for a scene: another order of the splats or set of
         visible ones), so that the objective can jump on the way there.  False at points that are not evaluated; None for an
         objective that does not name its pieces.
-    evaluations: of the objective, with the one at the centre.  looks: number of hold-outs drawn.
+    evaluations: of the objective, with the one at the centre.  looks: number of hold-outs drawn.  bound: of the error at every
+        interpolated point (`interpolation`).
     """
 
     coordinates: tuple[Float64[Tensor, " _"], ...]
@@ -42,6 +42,7 @@ class Slice:
     reason: StopReason
     tolerance: float | None = None
     looks: int = 0
+    bound: float = 0.0
 
     @property
     def resolved(self) -> bool:
@@ -59,8 +60,8 @@ class Slice:
 
     @property
     def range(self) -> float:
-        """The largest difference between finite evaluated values."""
-        finite = self.loss[self.evaluated & self.loss.isfinite()]
+        """The largest difference between finite values."""
+        finite = self.loss[self.loss.isfinite()]
         return float(finite.max() - finite.min()) if finite.numel() else 0.0
 
     @property
@@ -70,9 +71,8 @@ class Slice:
 
     @property
     def interpolation_error(self) -> float:
-        """The bound of the error at every interpolated point over the range (`interpolation`), from those of the hold-out."""
-        others = int((~self.evaluated).sum())
-        return self._relative(error_bound(self.holdout.numpy(), others, self.looks))
+        """`bound` over the range."""
+        return self._relative(self.bound)
 
     def _relative(self, error: float) -> float:
         if self.evaluated.all() or error == 0:

@@ -1,7 +1,7 @@
 """Slices of an objective L: its values on a grid along one or two directions e_d, and its quadratic model.
 
-    f(x)     = L(center + sum_d x_d e_d)              evaluated where needed (`refinement`), interpolated elsewhere,
-                                                      never on the axes
+    f(x)     = L(center + sum_d x_d e_d)              evaluated where needed (`refinement`), interpolated elsewhere, on the
+                                                      axes only where there is a control
     model(x) = L + b . x + x^T A x / 2                b = E^T g,  A = E^T H E
 
 x is in multiples of the directions: for unit vectors in units of the parameters.  `curvature_reach` gives ranges in units of
@@ -9,7 +9,8 @@ the curvature instead: the distance r sqrt(2 dL / |lambda|), at which the quadra
 """
 
 from collections.abc import Sequence
-from math import isfinite, sqrt
+from dataclasses import replace
+from math import inf, isfinite, sqrt
 
 import numpy as np
 import torch
@@ -68,6 +69,7 @@ def evaluate_slice(
     generator: torch.Generator | None = None,
     store: Store | None = None,
     progress: Progress | None = None,
+    control: Loss | None = None,
 ) -> Slice:
     """loss on the grid coordinates[0] x coordinates[1] (d = 2) or along coordinates[0] (d = 1).
 
@@ -75,7 +77,8 @@ def evaluate_slice(
     settings.workers threads.  coordinates: increasing, in multiples of the directions.  gradient, operator: both at center, for
     the quadratic model, or neither; the model takes d matvecs, or none if the operator is given as the matrix E^T H E.
     settings: for a plane; every point of a line is evaluated.  generator: draws the hold-out points (`refinement`) of a plane;
-    may be None only if settings.tolerance is.  store: keeps evaluations, from which an interrupted run continues.
+    may be None only if settings.tolerance is.  store: keeps evaluations, from which an interrupted run continues.  control: a
+    cheap function that differs from loss by little that is smooth; a plane then takes few evaluations of loss (`refinement`).
     Raises InputError if the objective at the centre is not finite.
 
     >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
@@ -98,7 +101,11 @@ def evaluate_slice(
         slope, curvature = _derivatives(gradient, operator, directions)
         model = found.center_loss + points @ slope + ((points @ curvature) * points).sum(dim=1) / 2
         model = model.reshape(shape)
-    refined = _refined(found, axes, None if curvature is None else float(curvature[0, -1]), settings, generator)
+    cheap = None
+    if control is not None and settings.tolerance is not None and len(axes) == 2:
+        cheap = GridEvaluations(control, center, directions, points, settings.workers)
+    mixed = None if curvature is None or cheap else float(curvature[0, -1])
+    refined = _refined(found, axes, mixed, settings, generator, cheap)
     return Slice(
         coordinates=tuple(axes),
         loss=torch.from_numpy(refined.values).reshape(shape),
@@ -113,6 +120,7 @@ def evaluate_slice(
         reason=refined.reason,
         tolerance=None if found.known.all() else settings.tolerance,
         looks=refined.looks,
+        bound=refined.bound,
     )
 
 
@@ -122,13 +130,22 @@ def _refined(
     mixed: float | None,
     settings: SliceSettings,
     generator: torch.Generator | None,
+    cheap: GridEvaluations | None,
 ) -> Refined:
-    """Every point of a line evaluated; a plane refined adaptively.  mixed: the model's mixed derivative, for a plane."""
+    """Every point of a line evaluated; a plane refined adaptively.  mixed: the model's mixed derivative, for a plane.
+
+    cheap: of the control.
+    """
     if len(axes) == 1 or settings.tolerance is None or generator is None:
         found.require(range(len(found.value)))
         return Refined(found.value, np.empty(0), 0, "exact")
-    plane = PlaneInterpolant(axes[0].numpy(), axes[1].numpy(), mixed)
-    return evaluate_adaptively(found, plane, settings, generator)
+    x, y = (axis.numpy() for axis in axes)
+    plane = PlaneInterpolant(x, y, mixed)
+    if cheap is None:
+        return evaluate_adaptively(found, plane, settings, generator)
+    half = replace(settings, tolerance=settings.tolerance / 2, max_evaluations=inf)
+    control = cheap, evaluate_adaptively(cheap, plane, half, generator)
+    return evaluate_adaptively(found, PlaneInterpolant(x, y, through_axes=False), settings, generator, control)
 
 
 def _derivatives(
