@@ -270,9 +270,10 @@ def _rendered(
         step = float(torch.linalg.vector_norm((pair.vectors[:, 0] * steps).double()))
         reach = curvature_reach(value, RISE * at.value) if value and at.value > 0 else step
         doublings = min(max(ceil(log2(reach / step)), 1), MOST_DOUBLINGS) if step else 0
-        along = [step * 2.0**k for k in range(-HALVINGS, doublings + 1)]
-        probe = partial(finite_probe, objective.evaluate, objective.active.flat, pair.vectors[:, 0], at.operator)
-        probes.append(probe(along, report, FEW_POINTS) if value and step else None)
+        along, flat, vector = [step * 2.0**k for k in range(-HALVINGS, doublings + 1)], objective.active.flat, pair.vectors[:, 0]
+        probe = partial(finite_probe, objective.evaluate, flat, vector, at.operator, along, report, FEW_POINTS)
+        nearby = LossNearby.of(objective, vector[:, None], [flat + end * vector for end in (-along[-1], along[-1])])
+        probes.append(probe(nearby) if value and step else None)
         lengths.append(step)
     vectors = [pair.vectors[:, 0] for pair in pairs]
     kinks = [kink_curvature(objective, vector) for vector in vectors]

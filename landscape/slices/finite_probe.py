@@ -14,6 +14,9 @@ noise       standard deviation of the error of one value of L, from differences 
             along v, in which the smooth part of L cancels: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and
             Wild 2011, Sec. 2).  At least the resolution of the numbers that the objective returns (Python floats that are all
             float32 numbers count as float32)
+control     a function that is cheap and follows L but for what is small and smooth: c(d) is its own, plus that of L less the
+            control at every other step of the longest, CHECKED in all, between which it is interpolated.  Twice the largest
+            of these is added to the round-off at the others
 """
 
 from collections.abc import Sequence
@@ -36,6 +39,7 @@ from landscape.slices.grid_evaluations import Loss
 ORDER, NOISE_POINTS = 4, 24  # order of the differences, number of values
 CLOSER = 4  # the distance between these values is the smallest step over this ...
 ROUNDINGS = 4  # ... but at least this many round-offs of the parameters, so that each value is rounded differently
+CHECKED = 4  # steps
 WITHIN, RUN = 2.0, 3  # largest factor between c(d) and v.H v; consecutive steps that confirm
 STEPS = tuple(10.0 ** (k / 2) for k in range(-10, 1))  # for curves: `confirmation` needs steps that double
 
@@ -91,8 +95,11 @@ def finite_probe(
     steps: Sequence[float] = STEPS,
     progress: Progress | None = None,
     noise_points: int = NOISE_POINTS,
+    control: Loss | None = None,
 ) -> FiniteProbe:
     """Curvature along direction at finite steps, for one matvec and 2 len(steps) + 1 + noise_points evaluations.
+
+    With a control, these are its own, and of loss there are 2 CHECKED + 1 at most; smooth pieces are not told apart.
 
     loss, center: as for `evaluate_slice`.  operator: H at center.  steps: two or more, increasing, in multiples of direction.
     noise_points: number of values for the estimate of the noise, more than four.
@@ -108,8 +115,11 @@ def finite_probe(
     column_lengths(direction[:, None], "directions")
     origin, v = center.detach().double(), direction.detach().double()
     total = 2 * len(steps) + 1 + noise_points
-    at = _Line(loss, origin, v, center.dtype, total, progress)
-    middle, here = at(0.0)
+    whole = at = _Line(loss, origin, v, center.dtype, total, progress)
+    center_loss, here = middle, _ = at(0.0)
+    if control is not None:
+        at = _Line(control, origin, v, center.dtype, total, progress)
+        middle, here = at(0.0)[0], None
     if not isfinite(middle):
         raise InputError(f"expected a finite objective at the centre, got {middle}")
     # eps times the root mean square of theta_i / v_i with weights v_i^4: the step along v that rounding of theta makes
@@ -125,15 +135,22 @@ def finite_probe(
     curvatures = rises / d.square()
     Hv = product(operator, direction.to(operator.dtype)[:, None])[:, 0].double()
     slope = torch.finfo(center.dtype).eps * float((origin * Hv).norm()) / sqrt(12)
+    round_off = 4 * (6 * noise**2 + 2 * (d * slope).square()).sqrt() / d.square()
+    if control is not None:
+        checked = torch.arange(len(steps) - 1, -1, -2)[:CHECKED].flip(0)
+        rises = [sum(whole(sign * step)[0] - center_loss for sign in (1, -1)) for step in d[checked].tolist()]
+        rest = torch.tensor(rises, dtype=torch.float64) / d[checked].square() - curvatures[checked]
+        curvatures += torch.from_numpy(np.interp(np.arange(len(d)), checked.numpy(), rest.numpy()))
+        round_off += 2 * rest.abs().max() * torch.ones_like(d).index_fill(0, checked, 0.0)
     return FiniteProbe(
         steps=d,
         curvatures=curvatures,
-        round_off=4 * (6 * noise**2 + 2 * (d * slope).square()).sqrt() / d.square(),
+        round_off=round_off,
         discontinuous=None if here is None else other,
         infinitesimal=float(torch.dot(v, Hv)),
-        center_loss=middle,
+        center_loss=center_loss,
         noise=noise,
-        evaluations=total,
+        evaluations=whole.done,
     )
 
 
