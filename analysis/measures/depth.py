@@ -32,7 +32,7 @@ from torch import Tensor
 from analysis.records.schema import Depth, Rise
 from landscape.errors import InputError
 from landscape.probes import draw_probes
-from landscape.results import Bracket, Progress, finite_or_none
+from landscape.results import Bracket, Progress, draws_of, finite_or_none, mean_of_parts
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import TraceSettings
 from splat.curvature.objective import SceneObjective
@@ -41,7 +41,6 @@ from splat.curvature.traces import ONE_PERCENT, SampledTrace, sampled_traces
 KINDS = ("depth", "lateral")
 LATERAL_DIRECTIONS = 2
 STEPS = (0.01, 0.1, 1.0, 10.0)  # px
-DRAWS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,35 +145,34 @@ def depth_rises(
     objective: SceneObjective,
     generator: torch.Generator,
     steps: Sequence[float] = STEPS,
-    draws: int = DRAWS,
+    draws: int | None = None,
     progress: Progress | None = None,
 ) -> list[Rise]:
     """Rises of the loss by steps along and across the rays, with None for numbers that are not finite.
 
-    steps: px; draws: of the directions and signs, 2 or more.
+    steps: px; draws: of the directions and signs, 2 or more, in each view; by default as many as `draws_of`.
     """
+    views = len(objective.views)
+    draws = draws_of(views) if draws is None else draws
     if draws < 2:
         raise InputError(f"expected at least 2 draws, got {draws}")
     seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
-    rises, discontinuous = torch.zeros(2, len(steps), len(KINDS), draws, dtype=torch.float64)
-    for index in range(len(objective.views)):
+    rises, discontinuous = torch.zeros(2, len(steps), len(KINDS), views, draws, dtype=torch.float64)
+    for index in range(views):
         center, piece = objective.evaluate_view(index, objective.active)
         for draw, seed in enumerate(seeds):
             directions = _directions(objective, index, torch.Generator(generator.device).manual_seed(seed + index))
             for s, step in enumerate(steps):
                 for kind, direction in enumerate(directions):
                     ends = [_moved(objective, index, sign * step * direction) for sign in (1, -1)]
-                    rises[s, kind, draw] += sum(loss for loss, _ in ends) / 2 - center
-                    discontinuous[s, kind, draw] += sum(order != piece for _, order in ends) / 2
+                    rises[s, kind, index, draw] = sum(loss for loss, _ in ends) / 2 - center
+                    discontinuous[s, kind, index, draw] = sum(order != piece for _, order in ends) / 2
             if progress:
-                progress(
-                    index * draws + draw + 1, len(objective.views) * draws, "finite steps along and across the rays"
-                )
-    rises, discontinuous = rises / len(objective.views), discontinuous / len(objective.views)
-    values, errors = rises.mean(dim=2), rises.std(dim=2) / draws**0.5
+                progress(index * draws + draw + 1, views * draws, "finite steps along and across the rays")
+    values, errors = mean_of_parts(rises)
     ratio, relative = values[:, 0] / values[:, 1], errors / values
     columns = {"ratio": ratio, "ratio_error": ratio.abs() * relative.square().sum(dim=1).sqrt()}
-    for suffix, table in (("", values), ("_error", errors), ("_crossed", discontinuous.mean(dim=2))):
+    for suffix, table in (("", values), ("_error", errors), ("_crossed", discontinuous.mean(dim=(2, 3)))):
         columns |= {f"{name}{suffix}": table[:, kind] for kind, name in enumerate(KINDS)}
     numbers = torch.stack(list(columns.values()), dim=1).tolist()
     rows = [dict(zip(columns, map(finite_or_none, row), strict=True)) for row in numbers]

@@ -168,7 +168,9 @@ class LossNearby:
     """
 
     @classmethod
-    def of(cls, objective: SceneObjective, vectors: Float[Tensor, "p k"], ends: Sequence[Float[Tensor, " p"]]) -> Self | None:
+    def of(
+        cls, objective: SceneObjective, vectors: Float[Tensor, "p k"], ends: Sequence[Float[Tensor, " p"]]
+    ) -> Self | None:
         mass = torch.stack([masses(vector, objective.active) for vector in vectors.T])
         shares, order = (mass / mass.sum(dim=1, keepdim=True)).sort(dim=1, descending=True)
         followed = order[(shares.cumsum(dim=1) - shares) < FOLLOWED].unique()

@@ -6,7 +6,6 @@ optimiser    D the learning rate of every parameter at the first step: curvature
 A curvature unit is a step along one direction: that within which the curvature alone changes the loss by RISE of it.
 """
 
-import sys
 from dataclasses import asdict
 from typing import Literal
 
@@ -15,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.probes import draw_probes
-from landscape.results import sampling_error
+from landscape.results import draws_of, mean_of_parts
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
 from splat.training.state import LearningRates, learning_rates, position_rate
@@ -50,24 +49,28 @@ def step_lengths(rates: LearningRates, extent: float) -> dict[str, float]:
 
 
 def step_rises(
-    objective: SceneObjective, steps: Float[Tensor, " p"], generator: torch.Generator, draws: int = 3
+    objective: SceneObjective, steps: Float[Tensor, " p"], generator: torch.Generator, draws: int | None = None
 ) -> dict[str, tuple[float, float]]:
     """Rise of the loss, by attribute, when each of its parameters moves by +-steps at random: as rendered, no model of it.
 
-    The mean over pairs of such a step and its opposite, in which the slope cancels, and its error (`sampling_error`).  It takes
-    2 draws losses an attribute, and one.
+    The mean over pairs of such a step and its opposite, in which the slope cancels, and its error (`mean_of_parts`).  Each view
+    has draws of its own, by default as many as `draws_of`.
     """
-    theta, found = objective.active.flat, {}
-    base = objective.loss(theta)
-    for name, rows in objective.blocks.items():
-        rises = torch.zeros(draws, dtype=torch.float64)
-        for i in range(draws):
-            step = torch.zeros_like(theta)
-            signs = draw_probes(rows.stop - rows.start, 1, generator, theta.dtype, "rademacher")[:, 0]
-            step[rows] = steps[rows] * signs
-            rises[i] = (objective.loss(theta + step) + objective.loss(theta - step)) / 2 - base
-        found[name] = float(rises.mean()), sampling_error(rises, sys.maxsize) or 0.0
-    return found
+    theta, count = objective.active.flat, draws or draws_of(len(objective.views))
+    rises = torch.zeros(len(objective.blocks), len(objective.views), count, dtype=torch.float64)
+    for index in range(len(objective.views)):
+        base, _ = objective.evaluate_view(index, objective.active)
+        for each, rows in zip(rises, objective.blocks.values(), strict=True):
+            for i in range(count):
+                step = torch.zeros_like(theta)
+                signs = draw_probes(rows.stop - rows.start, 1, generator, theta.dtype, "rademacher")[:, 0]
+                step[rows] = steps[rows] * signs
+                ends = (
+                    objective.evaluate_view(index, objective.active.with_flat(theta + s * step))[0] for s in (1, -1)
+                )
+                each[index, i] = sum(ends) / 2 - base
+    values, errors = (each.tolist() for each in mean_of_parts(rises))
+    return dict(zip(objective.blocks, zip(values, errors, strict=True), strict=True))
 
 
 def optimiser_units(objective: SceneObjective, rates: LearningRates, extent: float) -> Float[Tensor, " p"]:

@@ -270,7 +270,11 @@ def _rendered(
         step = float(torch.linalg.vector_norm((pair.vectors[:, 0] * steps).double()))
         reach = curvature_reach(value, RISE * at.value) if value and at.value > 0 else step
         doublings = min(max(ceil(log2(reach / step)), 1), MOST_DOUBLINGS) if step else 0
-        along, flat, vector = [step * 2.0**k for k in range(-HALVINGS, doublings + 1)], objective.active.flat, pair.vectors[:, 0]
+        along, flat, vector = (
+            [step * 2.0**k for k in range(-HALVINGS, doublings + 1)],
+            objective.active.flat,
+            pair.vectors[:, 0],
+        )
         probe = partial(finite_probe, objective.evaluate, flat, vector, at.operator, along, report, FEW_POINTS)
         nearby = LossNearby.of(objective, vector[:, None], [flat + end * vector for end in (-along[-1], along[-1])])
         probes.append(probe(nearby) if value and step else None)
@@ -325,7 +329,9 @@ def plane_of(
     accuracy = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most)
     nearby = None
     if objective is not None and settings.slice_plane:
-        ends_of_axes = [center + vectors @ center.new_tensor([x, y]) for x in axes[0][[0, -1]] for y in axes[1][[0, -1]]]
+        ends_of_axes = [
+            center + vectors @ center.new_tensor([x, y]) for x in axes[0][[0, -1]] for y in axes[1][[0, -1]]
+        ]
         nearby = LossNearby.of(objective, vectors, ends_of_axes)
     # E^T H E of Ritz vectors E is diagonal: no product is needed
     plane = evaluate_slice(

@@ -1,7 +1,7 @@
 """Positions along and across the rays, against the specification's dense derivatives and renders one by one."""
 
 from dataclasses import replace
-from math import inf, sqrt
+from math import erf, inf, sqrt
 
 import pytest
 import torch
@@ -18,6 +18,7 @@ from analysis.measures.depth import (
     rays_of,
 )
 from analysis.records.schema import Rise
+from landscape.results import t_quantile
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import TraceSettings
 from splat.curvature.objective import SceneObjective
@@ -136,7 +137,7 @@ def test_rises_are_those_of_the_loss_of_each_view():
     steps, draws = (0.5, 5.0), 3
     found = depth_rises(objective, generator(), steps, draws)
     seeds = torch.randint(2**62, (draws,), generator=generator()).tolist()
-    rises = torch.zeros(2, 2, draws, dtype=torch.float64)
+    rises = torch.zeros(2, 2, 2, draws, dtype=torch.float64)
     for index in range(2):
         alone = SceneObjective(objective.active, [objective.views[index]], loss, BACKGROUND, keep_unseen=True)
         center = alone.active.flat
@@ -146,10 +147,12 @@ def test_rises_are_those_of_the_loss_of_each_view():
                 u[alone.blocks["means"]] = direction.reshape(-1)
                 for s, step in enumerate(steps):
                     ends = alone.loss(center + step * u) + alone.loss(center - step * u)
-                    rises[s, kind, draw] += (ends / 2 - alone.loss(center)) / 2
+                    rises[s, kind, index, draw] = ends / 2 - alone.loss(center)
     values, errors = by_kind(found), by_kind(found, "_error")
-    assert torch.allclose(values, rises.mean(dim=2), rtol=1e-9, atol=1e-15)
-    assert torch.allclose(errors, rises.std(dim=2) / sqrt(3), rtol=1e-9, atol=1e-15)
+    # the views' own rises are no error; Student's factor at one standard error, for two views' 2 x 2 degrees of freedom
+    student = t_quantile(4, erf(sqrt(2))) / 2
+    assert torch.allclose(values, rises.mean(dim=(2, 3)), rtol=1e-9, atol=1e-15)
+    assert torch.allclose(errors, student * (rises.var(dim=3).sum(dim=2) / 3).sqrt() / 2, rtol=1e-9, atol=1e-15)
     assert tuple(rise.pixels for rise in found) == steps
     for rise, (depth, lateral), relative in zip(found, values.tolist(), (errors / values).square().sum(dim=1).tolist()):
         assert rise.ratio == pytest.approx(depth / lateral)
