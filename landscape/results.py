@@ -27,7 +27,6 @@ StopReason = Literal["tolerance", "noise floor", "matvec budget", "evaluation bu
 Sign = Literal["positive", "negative", "zero", "undetermined"]
 Number = float | None
 LINE, SHORT = 100, 60  # characters of a line, and of a list in it
-FEWEST_DRAWS = 6
 
 Progress = Callable[[int, int, str], None]
 """progress(done, most, state): units of work done, the largest possible number of them, the estimate so far in words."""
@@ -115,11 +114,6 @@ def sampling_error(terms: Float64[Tensor, " m"], population: int) -> Number:
         return None
     student = t_quantile(m - 1, erf(sqrt(2))) / 2
     return student * float(standard_deviation(terms)) * sqrt(1 / m - 1 / population)
-
-
-def draws_of(parts: int) -> int:
-    """Enough draws in each of so many parts for `mean_of_parts`: FEWEST_DRAWS in all, and two in each."""
-    return max(2, -(-FEWEST_DRAWS // parts))
 
 
 def mean_of_parts(draws: Float64[Tensor, "*k m s"]) -> tuple[Float64[Tensor, "*k"], Float64[Tensor, "*k"]]:

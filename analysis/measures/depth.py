@@ -32,7 +32,7 @@ from torch import Tensor
 from analysis.records.schema import Depth, Rise
 from landscape.errors import InputError
 from landscape.probes import draw_probes
-from landscape.results import Bracket, Progress, draws_of, finite_or_none, mean_of_parts
+from landscape.results import Bracket, Progress, finite_or_none, mean_of_parts
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import TraceSettings
 from splat.curvature.objective import SceneObjective
@@ -145,18 +145,17 @@ def depth_rises(
     objective: SceneObjective,
     generator: torch.Generator,
     steps: Sequence[float] = STEPS,
-    draws: int | None = None,
+    draws: int = 2,
     progress: Progress | None = None,
 ) -> list[Rise]:
     """Rises of the loss by steps along and across the rays, with None for numbers that are not finite.
 
-    steps: px; draws: of the directions and signs, 2 or more, in each view; by default as many as `draws_of`.
+    steps: px; draws: of the directions and signs, 2 or more, in each view.
     """
-    views = len(objective.views)
-    draws = draws_of(views) if draws is None else draws
     if draws < 2:
         raise InputError(f"expected at least 2 draws, got {draws}")
     seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
+    views = len(objective.views)
     rises, discontinuous = torch.zeros(2, len(steps), len(KINDS), views, draws, dtype=torch.float64)
     for index in range(views):
         center, piece = objective.evaluate_view(index, objective.active)

@@ -16,14 +16,15 @@ and with signs held still these differences are -0.027 to -0.011.  A steep end g
 steps) 48 becomes 61 over the optimiser's step, where kinks make 13 by the formula.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from functools import partial
+from math import inf
 
 import numpy as np
 import scipy
 import torch
-from jaxtyping import Float, Float64, Int, UInt8
+from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
 from analysis.measures.localization import mass_shares, masses, participation
@@ -33,13 +34,12 @@ from analysis.records.run_files import Carrier, Steepest
 from analysis.records.schema import Carries, Renders
 from splat.curvature.fields import Values
 from splat.curvature.objective import SceneObjective
-from splat.losses.reference import REACH, WINDOW
+from splat.losses.reference import REACH
 from splat.model.gaussians import Gaussians
 from splat.projection.formulas import Lens, lens_of
 from splat.projection.reference import NEEDLE
-from splat.render.autograd import project_by_kernel, rasterize_by_kernel
 from splat.render.backend import CPU, Raster, backend_of
-from splat.render.forward import touches
+from splat.render.forward import rasterize_view, touches, weights
 from splat.render.render import render
 from splat.render.sight import Sight
 from splat.scenes.view import View
@@ -56,8 +56,7 @@ PLACES = (
     ("in the lower left", "at the bottom", "in the lower right"),
 )
 Pictures = dict[str, UInt8[np.ndarray, "..."]]
-# of `LossNearby`: mass of each vector on the Gaussians that it follows, most of these, standard deviations to the edge of their
-# splats, and the largest part of the images
+# of `loss_nearby`: mass on the Gaussians followed, most of these, standard deviations to their edges, largest part of the views
 FOLLOWED, FEW, EDGE, PART = 0.99, 16, 3.5, 0.25
 
 
@@ -130,16 +129,9 @@ def heaviest(
 
 
 def weights_of(objective: SceneObjective) -> Float[Tensor, "m n"]:
-    """The sum of alpha T over the pixels of each view: the derivative of a channel's sum in a splat's colour."""
-    found = []
-    for view in objective.views:
-        splats = project_by_kernel(objective.active, view.camera, objective.settings)
-        coloured = replace(splats, colours=splats.colours.detach().requires_grad_())
-        size = view.camera.width, view.camera.height
-        image, _ = rasterize_by_kernel(coloured, objective.background, *size, objective.settings)
-        (changes,) = torch.autograd.grad(image[0].sum(), coloured.colours)
-        found.append(changes[:, 0])
-    return torch.stack(found)
+    """The sum of alpha T over the pixels of each view."""
+    render = partial(rasterize_view, background=objective.background, settings=objective.settings)
+    return torch.stack([weights(render(objective.active, view.camera)) for view in objective.views])
 
 
 def kink_curvature(objective: SceneObjective, vector: Float[Tensor, " p"]) -> float:
@@ -159,72 +151,61 @@ def heaviest_view(objective: SceneObjective, vector: Float[Tensor, " p"]) -> int
     return int(weights_of(objective)[:, masses(vector, objective.active).argmax()].argmax())
 
 
-class LossNearby:
-    """The loss in boxes of the views around the few Gaussians that carry some unit vectors, less constants, on the CPU.
+def loss_nearby(
+    objective: SceneObjective, vectors: Float[Tensor, "p k"], ends: Sequence[Float[Tensor, " p"]]
+) -> Callable[[Tensor], float] | None:
+    """The loss in boxes of the views around the few Gaussians that carry some unit vectors, less constants.
 
     As a function of the parameters it differs from the loss by what the other Gaussians change outside of the boxes: little,
-    and smoothly (a `control` of `landscape.evaluate_slice`), for a tenth of the time.  ends: the parameters that the Gaussians
-    move between.  `of` is None where the vectors lie on many Gaussians, or the boxes are a large part of the views.
+    and smoothly (a `control` of `landscape.evaluate_slice`); it takes a tenth of the time.  ends: the parameters that the
+    Gaussians move between.  None where they are many, their boxes a large part of the views, or the device not the CPU.
     """
+    active, found, pixels = objective.active, [], 0
+    mass = torch.stack([masses(vector, active) for vector in vectors.T])
+    shares, order = (mass / mass.sum(dim=1, keepdim=True)).sort(dim=1, descending=True)
+    followed = order[(shares.cumsum(dim=1) - shares) < FOLLOWED].unique()
+    if backend_of(active.flat) is not CPU or len(followed) > FEW:
+        return None
+    settings = replace(objective.loss_settings, border="padded")  # a box of any size has the windows of all of its pixels
+    places = active.with_flat(torch.arange(active.flat.numel(), dtype=torch.float64))  # exact
+    moved = [active.with_flat(flat).select(followed) for flat in (active.flat, *ends)]
 
-    @classmethod
-    def of(
-        cls, objective: SceneObjective, vectors: Float[Tensor, "p k"], ends: Sequence[Float[Tensor, " p"]]
-    ) -> Self | None:
-        mass = torch.stack([masses(vector, objective.active) for vector in vectors.T])
-        shares, order = (mass / mass.sum(dim=1, keepdim=True)).sort(dim=1, descending=True)
-        followed = order[(shares.cumsum(dim=1) - shares) < FOLLOWED].unique()
-        if backend_of(objective.active.flat) is not CPU or len(followed) > FEW:
-            return None
-        moved = [objective.active.with_flat(flat).select(followed) for flat in (objective.active.flat, *ends)]
-        found = cls(objective, followed, moved)
-        pixels = sum(view.camera.width * view.camera.height for view in objective.views)
-        return found if found.pixels <= PART * pixels else None
-
-    def __init__(self, objective: SceneObjective, followed: Int[Tensor, " m"], moved: Sequence[Gaussians]) -> None:
-        self.objective, self.pixels, self._boxes = objective, 0, []
-        active, weight = objective.active, 1 / len(objective.views)
-        places = active.with_flat(torch.arange(active.flat.numel(), dtype=torch.float64))  # exact
-        for view in objective.views:
-            lens, size = lens_of(view.camera, objective.settings), view.camera.width * view.camera.height
-            for rows, columns in boxes(moved, lens, view.camera.width, view.camera.height):
-                part = view.image[:, rows, columns].contiguous()
-                loss = CPU.view_loss(part, objective.loss_settings, active.flat)
-                box = lens, rows.start, columns.start, *part.shape[1:]
-                seen = touches(self._raster(active, *box))
-                seen[followed] = True
-                some, share = active.select(seen), weight * part[0].numel() / size
-                self._boxes.append((box, places.select(seen).flat.long(), some, loss, share))
-                self.pixels += part[0].numel()
-
-    def __call__(self, flat: Float[Tensor, " p"]) -> float:
-        return sum(
-            share * loss.value(self._raster(some.with_flat(flat[index]), *box).planes)
-            for box, index, some, loss, share in self._boxes
-        )
-
-    def _raster(self, gaussians: Gaussians, lens: Lens, top: int, left: int, height: int, width: int) -> Raster:
+    def raster(gaussians: Gaussians, lens: Lens, corner: Tensor, height: int, width: int) -> Raster:
         splats, depths, drawn = CPU.project(gaussians, lens)
-        splats[:, :2] -= splats.new_tensor([left, top])
-        return CPU.rasterize(splats, depths, drawn, self.objective.background, width, height, self.objective.settings)
+        splats[:, :2] -= corner
+        return CPU.rasterize(splats, depths, drawn, objective.background, width, height, objective.settings)
+
+    for view in objective.views:
+        lens, size = lens_of(view.camera, objective.settings), view.camera.width * view.camera.height
+        for rows, columns in boxes(moved, lens, view.camera.width, view.camera.height):
+            part = view.image[:, rows, columns].contiguous()
+            box = lens, torch.tensor([columns.start, rows.start]), *part.shape[1:]
+            seen = touches(raster(active, *box))
+            seen[followed] = True
+            loss = CPU.view_loss(part, settings, active.flat)
+            share = part[0].numel() / size / len(objective.views)
+            found.append((box, places.select(seen).flat.long(), active.select(seen), loss, share))
+            pixels += share
+    if pixels > PART:
+        return None
+    return lambda flat: sum(
+        share * loss.value(raster(some.with_flat(flat[index]), *box).planes) for box, index, some, loss, share in found
+    )
 
 
 def boxes(moved: Sequence[Gaussians], lens: Lens, width: int, height: int) -> list[tuple[slice, slice]]:
     """Rows and columns of boxes in a view that hold the splats of Gaussians wherever these move, and SSIM's windows around."""
-    inside, found = np.zeros((height, width), bool), []
+    inside, low, high = np.zeros((height, width), bool), [], []
     for gaussians in moved:
         splats, _, drawn = CPU.project(gaussians, lens)
-        x, y, a, b, c = splats[:, :5].T
-        wide, tall = (EDGE * (side / (a * c - b * b)).sqrt() + REACH for side in (c, a))
-        ends = torch.stack([x - wide, x + wide, y - tall, y + tall], dim=1)
-        found.append(torch.where(drawn[:, None], ends, torch.nan))
-    for ends in torch.stack(found).unbind(dim=1):  # of each Gaussian
-        if len(ends := ends[ends.isfinite().all(dim=1)]):
-            (left, _, top, _), (_, right, _, bottom) = (part.clamp(0, max(width, height)).int().tolist()
-                                                        for part in (ends.amin(dim=0), ends.amax(dim=0) + 1))  # fmt: skip
-            inside[top:bottom, left:right] = True
-    found = scipy.ndimage.find_objects(scipy.ndimage.label(inside)[0])
-    return [box for box in found if min(side.stop - side.start for side in box) >= WINDOW]
+        a, b, c = splats[:, 2:5].T
+        reach = REACH + EDGE * (torch.stack([c, a]) / (a * c - b * b)).sqrt().T
+        low.append(torch.where(drawn[:, None], splats[:, :2] - reach, inf))
+        high.append(torch.where(drawn[:, None], splats[:, :2] + reach + 1, -inf))
+    corners = torch.cat([torch.stack(low).amin(dim=0), torch.stack(high).amax(dim=0)], dim=1)
+    for left, top, right, bottom in corners.clamp(0, max(width, height)).int().tolist():  # of each Gaussian
+        inside[top:bottom, left:right] = True
+    return scipy.ndimage.find_objects(scipy.ndimage.label(inside)[0])
 
 
 def shown_step(renders: Renders) -> float:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.probes import draw_probes
-from landscape.results import draws_of, mean_of_parts
+from landscape.results import mean_of_parts
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
 from splat.training.state import LearningRates, learning_rates, position_rate
@@ -49,19 +49,19 @@ def step_lengths(rates: LearningRates, extent: float) -> dict[str, float]:
 
 
 def step_rises(
-    objective: SceneObjective, steps: Float[Tensor, " p"], generator: torch.Generator, draws: int | None = None
+    objective: SceneObjective, steps: Float[Tensor, " p"], generator: torch.Generator, draws: int = 2
 ) -> dict[str, tuple[float, float]]:
     """Rise of the loss, by attribute, when each of its parameters moves by +-steps at random: as rendered, no model of it.
 
     The mean over pairs of such a step and its opposite, in which the slope cancels, and its error (`mean_of_parts`).  Each view
-    has draws of its own, by default as many as `draws_of`.
+    has draws of its own.
     """
-    theta, count = objective.active.flat, draws or draws_of(len(objective.views))
-    rises = torch.zeros(len(objective.blocks), len(objective.views), count, dtype=torch.float64)
+    theta = objective.active.flat
+    rises = torch.zeros(len(objective.blocks), len(objective.views), draws, dtype=torch.float64)
     for index in range(len(objective.views)):
         base, _ = objective.evaluate_view(index, objective.active)
         for each, rows in zip(rises, objective.blocks.values(), strict=True):
-            for i in range(count):
+            for i in range(draws):
                 step = torch.zeros_like(theta)
                 signs = draw_probes(rows.stop - rows.start, 1, generator, theta.dtype, "rademacher")[:, 0]
                 step[rows] = steps[rows] * signs

@@ -33,7 +33,7 @@ from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import ProductCheck, check_against_gradient
 from analysis.measures.localization import masses, participation
 from analysis.measures.memory import basis_within, vectors_within
-from analysis.measures.steepest import LossNearby, heaviest, kink_curvature
+from analysis.measures.steepest import heaviest, kink_curvature, loss_nearby
 from analysis.measures.units import step_rises
 from analysis.probe.measured import LeftOut, Measured, PlaneSlice, Rendered, Search, Spectrum
 from analysis.probe.plan import MOST_AT_ONCE
@@ -276,7 +276,7 @@ def _rendered(
             pair.vectors[:, 0],
         )
         probe = partial(finite_probe, objective.evaluate, flat, vector, at.operator, along, report, FEW_POINTS)
-        nearby = LossNearby.of(objective, vector[:, None], [flat + end * vector for end in (-along[-1], along[-1])])
+        nearby = loss_nearby(objective, vector[:, None], [flat + end * vector for end in (-along[-1], along[-1])])
         probes.append(probe(nearby) if value and step else None)
         lengths.append(step)
     vectors = [pair.vectors[:, 0] for pair in pairs]
@@ -316,7 +316,7 @@ def plane_of(
 ) -> PlaneSlice | None:
     """The loss over the plane of the first two eigenvectors; None where a note says why.  value, gradient: at center.
 
-    objective: where the loss is that of one, so that it may be rendered in parts of its views (`LossNearby`).
+    objective: where the loss is that of one, so that it may be rendered in parts of its views (`loss_nearby`).
     """
     loss_scale, curvatures = settings.slice_rise * value, ends.largest.values[:2]
     if loss_scale <= 0 or not curvatures.all():
@@ -332,7 +332,7 @@ def plane_of(
         ends_of_axes = [
             center + vectors @ center.new_tensor([x, y]) for x in axes[0][[0, -1]] for y in axes[1][[0, -1]]
         ]
-        nearby = LossNearby.of(objective, vectors, ends_of_axes)
+        nearby = loss_nearby(objective, vectors, ends_of_axes)
     # E^T H E of Ritz vectors E is diagonal: no product is needed
     plane = evaluate_slice(
         loss, center, vectors, axes, gradient, curvatures.diag(), accuracy, generator, progress=report,

@@ -11,7 +11,7 @@ TIMED = 3  # renders; the median counts
 MEASURES = 33.0  # products with MOST_AT_ONCE vectors that --measures takes as long as
 PRODUCT, BEFORE = 4.5, 50  # in renders: a product with MOST_AT_ONCE vectors; all that comes before the first stage
 PICTURES, QUICK_PICTURES = 3.0, 0.5  # seconds to draw them, which hardly depend on the scene
-POINTS = 320  # of a slice's plane that are usually rendered
+POINTS = 110  # of a slice's plane: with the others' boxes usually as long as so many renders
 
 
 def seconds_of_render(objective: SceneObjective) -> float:
@@ -32,8 +32,8 @@ def expected_seconds(settings: ProbeSettings, render: float, further: float = 0.
     products, renders = further, BEFORE
     products += 0.45 * settings.trace_samples if settings.trace_samples else 11  # traces
     products += 28  # both ends of the spectrum
-    renders += 70  # along these
+    renders += 50  # along these
     renders += 0.75 * min(POINTS, settings.slice_points**2) if settings.slice_plane else 1.5 * settings.slice_points
     products += 0.3 * settings.density_matvecs
-    products, renders = (products, renders) if settings.depth is None else (products + 3, renders + 60)
+    products, renders = (products, renders) if settings.depth is None else (products + 3, renders + 35)
     return (PRODUCT * products + renders) * render + (PICTURES if settings.slice_plane else QUICK_PICTURES)

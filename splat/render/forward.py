@@ -43,5 +43,10 @@ def background_of(gaussians: Gaussians, colour: Float[Tensor, "3"] | None) -> Fl
 
 def touches(raster: Raster) -> Bool[Tensor, " n"]:
     """Mask of the splats with weight in some pixel of the image: the exact support of the view's derivatives."""
+    return weights(raster) != 0
+
+
+def weights(raster: Raster) -> Float[Tensor, " n"]:
+    """The sum of alpha T over the pixels: the derivative of a channel's sum in each splat's colour."""
     ones = torch.ones_like(raster.crop(raster.planes))
-    return raster.backward(raster.pad(ones)).moments[:, 6] != 0
+    return raster.backward(raster.pad(ones)).moments[:, 6]

@@ -10,6 +10,7 @@ from analysis.measures.steepest import (
     End,
     crop_around,
     kink_curvature,
+    loss_nearby,
     outline_of,
     rendered_sentence,
     sentence,
@@ -28,6 +29,7 @@ from splat.losses.reference import LossSettings
 from splat.projection.reference import project
 from splat.render.render import render
 from splat.render.sight import sight
+from splat.scenes.view import View
 from tests.splat.curvature.test_fields import scene_of
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import random_gaussians
@@ -181,6 +183,31 @@ def test_the_curvature_of_kinks_is_what_the_hessian_leaves_out_of_losses_at_fini
         said.append(kink_curvature(objective, v))
     assert sum(seen) == pytest.approx(sum(said), rel=0.15) and min(said) > 0
     assert kink_curvature(SceneObjective(gaussians, views, smooth, BACKGROUND), v) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("loss", "apart"), [(LossSettings(), 0.01), (LossSettings("l2", ssim_weight=0.5, border="valid"), 0.2)]
+)
+def test_the_loss_near_the_carriers_follows_the_loss(loss, apart):
+    """In two views, one of them with two boxes; other Gaussians, before and behind, stand still."""
+    rows = [
+        {"means": [0.6, 0.3, 3.0]},
+        {"means": [-0.8, -0.5, 4.0]},
+        {"means": [0.75, 0.45, 4.0]},
+        {"means": [-0.7, -0.5, 5.0]},
+    ]
+    scene = scene_of([each | {"log_scales": [-3.3, -3.0, -3.4]} for each in rows], [[0.0, 0.0, 0.0], [-0.4, 0.0, 0.0]])
+    picture = torch.rand(3, 128, 160, generator=torch.Generator().manual_seed(0))
+    views = [View(view.name, view.camera.resized(160, 128), picture) for view in scene.views]
+    objective = SceneObjective(scene.active, views, loss, BACKGROUND.double())
+    v = torch.zeros_like(objective.active.flat)
+    v[:6] = torch.tensor([0.6, -0.5, 0.2, 0.3, 0.4, -0.3]) / 0.99**0.5
+    places = [objective.active.flat + step * v for step in (-0.12, -0.05, 0.0, 0.07, 0.12)]
+    near = loss_nearby(objective, v[:, None], [places[0], places[-1]])
+    assert near is not None
+    whole, part = ([loss(place) for place in places] for loss in (objective.loss, near))
+    assert np.ptp(np.subtract(whole, part)) < apart * np.ptp(whole)
+    assert loss_nearby(scene, v[:, None], [places[0], places[-1]]) is None  # a large part of smaller pictures
 
 
 def test_weights_of_a_view_are_those_of_the_pass_over_its_pixels(shown):

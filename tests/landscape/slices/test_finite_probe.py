@@ -102,6 +102,25 @@ def test_the_measured_noise_is_unbiased():
     assert abs(squares.mean() - 1) < 4 * squares.std() / len(squares) ** 0.5
 
 
+def test_with_a_control_a_few_evaluations_tell_the_rest():
+    def rough(theta):
+        return float(theta.square().sum() + 0.3 * theta.abs().sum() + 1e-9 * torch.sin(1e9 * theta).sum())
+
+    def whole(theta):
+        return rough(theta) + 0.01 * float((theta**4).sum())
+
+    steps, center, v = (
+        [0.01 * 2**k for k in range(11)],
+        torch.zeros(1, dtype=torch.float64),
+        torch.ones(1, dtype=torch.float64),
+    )
+    H = DenseOperator(torch.full((1, 1), 2.0, dtype=torch.float64))
+    alone, found = (finite_probe(whole, center, v, H, steps, control=each) for each in (None, rough))
+    off = (found.curvatures - alone.curvatures).abs()
+    assert found.evaluations == 1 + 2 * 4 < alone.evaluations / 4 and found.center_loss == alone.center_loss
+    assert (off[[4, 6, 8, 10]] < 1e-9).all() and off[9] > 0.01 and (off <= found.round_off).all()
+
+
 def test_noise_is_at_least_the_resolution_of_what_the_objective_returns():
     found = probed(lambda theta: torch.tensor(3.0))
     assert found.noise == 3 * torch.finfo(torch.float32).eps and not found.curvatures.any()

@@ -39,10 +39,15 @@ def jumps(theta):
     return valley(theta) + 0.02 * noise(theta)
 
 
-def sliced(loss, seed=0, axes=(SIDE, SIDE), **settings):
+def beside(theta):
+    """`jumps` and what is small and smooth."""
+    return jumps(theta) + 0.02 * bowl(theta)
+
+
+def sliced(loss, seed=0, axes=(SIDE, SIDE), control=None, **settings):
     center, generator = torch.zeros(2, dtype=torch.float64), torch.Generator().manual_seed(seed)
     chosen, directions = SliceSettings(**settings), PLANE[:, : len(axes)]
-    return evaluate_slice(loss, center, directions, list(axes), settings=chosen, generator=generator)
+    return evaluate_slice(loss, center, directions, list(axes), settings=chosen, generator=generator, control=control)
 
 
 @cache
@@ -152,6 +157,21 @@ def test_of_noise_every_point_is_evaluated():
     found = sliced(noise, axes=(symmetric_axis(1.0, 21),) * 2)
     assert found.evaluated.all() and found.reason == "exact" and found.interpolation_error == 0
     assert found.tolerance is None
+
+
+def test_with_a_control_that_has_the_jumps_few_evaluations_tell_the_rest():
+    for seed in range(5):
+        calls = []
+        found = sliced(lambda theta: calls.append(theta) or beside(theta), seed, control=jumps)
+        off = errors(beside, found)
+        assert found.evaluations == len(calls) == 1 + 1 + 8 + 22 < sliced(beside, seed).evaluations / 4
+        assert found.reason == "tolerance" and off.max() <= found.interpolation_error <= 0.01
+        assert 0 < found.error_seen <= found.interpolation_error
+
+
+def test_a_control_without_the_jumps_costs_evaluations_and_no_accuracy():
+    found = sliced(jumps, control=bowl)
+    assert found.evaluations > 100 and errors(jumps, found).max() <= found.interpolation_error <= 0.01
 
 
 def test_losses_that_are_not_finite_are_never_interpolated():
