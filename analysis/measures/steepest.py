@@ -166,9 +166,11 @@ def loss_nearby(
     followed = order[(shares.cumsum(dim=1) - shares) < FOLLOWED].unique()
     if backend_of(active.flat) is not CPU or len(followed) > FEW:
         return None
-    settings = replace(objective.loss_settings, border="padded")  # a box of any size has the windows of all of its pixels
+    # a box of any size has the windows of all of its pixels
+    settings = replace(objective.loss_settings, border="padded")
     places = active.with_flat(torch.arange(active.flat.numel(), dtype=torch.float64))  # exact
-    moved = [active.with_flat(flat).select(followed) for flat in (active.flat, *ends)]
+    everywhere = [active, *map(active.with_flat, ends)]
+    moved = [each.select(followed) for each in everywhere]
 
     def raster(gaussians: Gaussians, lens: Lens, corner: Tensor, height: int, width: int) -> Raster:
         splats, depths, drawn = CPU.project(gaussians, lens)
@@ -180,7 +182,9 @@ def loss_nearby(
         for rows, columns in boxes(moved, lens, view.camera.width, view.camera.height):
             part = view.image[:, rows, columns].contiguous()
             box = lens, torch.tensor([columns.start, rows.start]), *part.shape[1:]
-            seen = touches(raster(active, *box))
+            seen = torch.stack([touches(raster(each, *box)) for each in everywhere]).any(dim=0)
+            if not seen[followed].any():
+                continue
             seen[followed] = True
             loss = CPU.view_loss(part, settings, active.flat)
             share = part[0].numel() / size / len(objective.views)

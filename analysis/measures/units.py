@@ -65,10 +65,8 @@ def step_rises(
                 step = torch.zeros_like(theta)
                 signs = draw_probes(rows.stop - rows.start, 1, generator, theta.dtype, "rademacher")[:, 0]
                 step[rows] = steps[rows] * signs
-                ends = (
-                    objective.evaluate_view(index, objective.active.with_flat(theta + s * step))[0] for s in (1, -1)
-                )
-                each[index, i] = sum(ends) / 2 - base
+                moved = [objective.active.with_flat(theta + sign * step) for sign in (1, -1)]
+                each[index, i] = sum(objective.evaluate_view(index, ends)[0] for ends in moved) / 2 - base
     values, errors = (each.tolist() for each in mean_of_parts(rises))
     return dict(zip(objective.blocks, zip(values, errors, strict=True), strict=True))
 

@@ -9,6 +9,7 @@
                         of the optimiser's to about one at which the curvature alone changes the loss by 1%; the Gaussian that
                         carries each end; the loss after random steps of the optimiser in each attribute
     slice               the loss over the plane of the first two eigenvectors: rendered where needed, interpolated elsewhere
+                        (both on a CPU in boxes around the few Gaussians that move, where few whole renders tell the rest)
     density *           stochastic Lanczos quadrature, for sums of |lambda|; the Krylov spaces of its first runs
                         contain the iterates of the paper's power iteration
     depth *             the positions' gradient and curvature along the rays and across them, and finite steps both ways
@@ -270,11 +271,8 @@ def _rendered(
         step = float(torch.linalg.vector_norm((pair.vectors[:, 0] * steps).double()))
         reach = curvature_reach(value, RISE * at.value) if value and at.value > 0 else step
         doublings = min(max(ceil(log2(reach / step)), 1), MOST_DOUBLINGS) if step else 0
-        along, flat, vector = (
-            [step * 2.0**k for k in range(-HALVINGS, doublings + 1)],
-            objective.active.flat,
-            pair.vectors[:, 0],
-        )
+        along = [step * 2.0**k for k in range(-HALVINGS, doublings + 1)]
+        flat, vector = objective.active.flat, pair.vectors[:, 0]
         probe = partial(finite_probe, objective.evaluate, flat, vector, at.operator, along, report, FEW_POINTS)
         nearby = loss_nearby(objective, vector[:, None], [flat + end * vector for end in (-along[-1], along[-1])])
         probes.append(probe(nearby) if value and step else None)
@@ -329,10 +327,8 @@ def plane_of(
     accuracy = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most)
     nearby = None
     if objective is not None and settings.slice_plane:
-        ends_of_axes = [
-            center + vectors @ center.new_tensor([x, y]) for x in axes[0][[0, -1]] for y in axes[1][[0, -1]]
-        ]
-        nearby = loss_nearby(objective, vectors, ends_of_axes)
+        corners = [center.new_tensor([x, y]) for x in axes[0][[0, -1]] for y in axes[1][[0, -1]]]
+        nearby = loss_nearby(objective, vectors, [center + vectors @ corner for corner in corners])
     # E^T H E of Ritz vectors E is diagonal: no product is needed
     plane = evaluate_slice(
         loss, center, vectors, axes, gradient, curvatures.diag(), accuracy, generator, progress=report,

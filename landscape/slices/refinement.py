@@ -102,7 +102,7 @@ def evaluate_adaptively(
         evaluations.require(filling)
         exact, beside, others = 0.0, 0.0, 0.0  # the control: evaluated, refined, and its bound
         if control is not None:
-            control[0].require([*np.flatnonzero(known), *drawn])
+            control[0].require(np.append(np.flatnonzero(known), drawn).tolist())
             exact, beside, others = control[0].value, control[1].values, control[1].bound
         predicted = grid(evaluations.value - exact)
         evaluations.require(drawn)

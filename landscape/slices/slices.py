@@ -103,7 +103,7 @@ def evaluate_slice(
         model = model.reshape(shape)
     cheap = None
     if control is not None and settings.tolerance is not None and len(axes) == 2:
-        cheap = GridEvaluations(control, center, directions, points, settings.workers)
+        cheap = GridEvaluations(control, center, directions, points, settings.workers, progress=progress)
     mixed = None if curvature is None or cheap else float(curvature[0, -1])
     refined = _refined(found, axes, mixed, settings, generator, cheap)
     return Slice(
