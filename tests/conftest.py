@@ -11,7 +11,6 @@ from torch import Tensor
 
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from tests.compiling import compile_each_once
 from tests.forks import DRAWING, stand_in
 from tests.splat.gpu.interpreted import interpreter, unwritten
 
@@ -20,9 +19,6 @@ if not torch.cuda.is_available():
 
 # the processes of a run share the cores
 torch.set_num_threads(max(1, torch.get_num_threads() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
-
-if "PYTEST_XDIST_WORKER" in os.environ:
-    compile_each_once()
 
 # under nohup these are ignored, here and by the commands that the tests start
 for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
@@ -44,10 +40,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def pictures() -> Iterator[None]:
-    """Commands have their pictures drawn by forks, but in the tests of what draws."""
+def commands() -> Iterator[None]:
+    """Commands have their pictures drawn by forks, but in the tests of what draws, and do not fork a process with threads."""
     with pytest.MonkeyPatch.context() as patch:
         stand_in(patch, DRAWING)
+        patch.setattr("analysis.commands.compiling.compile_ahead", lambda: None)
         yield
 
 

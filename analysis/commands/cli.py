@@ -249,8 +249,10 @@ def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     with ExitStack() as around:
         given = [options, ["landscape", *arguments]] if command.recorded else [options]
         if command.compiles or command.recorded:
-            from analysis.commands.compiling import compiling_is_said
+            with loading():
+                from analysis.commands.compiling import compile_ahead, compiling_is_said
 
+                compile_ahead()
             around.enter_context(compiling_is_said(Console(stderr=True)))
         if command.draws:
             from analysis.console.drawing import drawing

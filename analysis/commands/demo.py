@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from analysis.commands.options import DemoOptions
+from analysis.console.drawing import drawing
 from analysis.console.plain import say
 from analysis.probe.command import run_probe
 from analysis.probe.options import ProbeOptions
@@ -42,7 +43,8 @@ def run_demo(options: DemoOptions) -> int:
         return code
     typed = ["probe", str(checkpoint)]
     _announce(typed)
-    return run_probe(ProbeOptions(checkpoint), ["landscape", *typed])
+    with drawing("make_all") as drawn:
+        return run_probe(ProbeOptions(checkpoint), ["landscape", *typed], drawn)
 
 
 def _announce(arguments: list[str]) -> None:

@@ -8,7 +8,8 @@ to anything else (training, scenes) compiles nothing anew.  Folders of earlier c
 
 import os
 import re
-from contextlib import suppress
+from contextlib import ExitStack, suppress
+from fcntl import LOCK_EX, flock
 from hashlib import sha256
 from pathlib import Path
 from tempfile import gettempdir
@@ -16,6 +17,8 @@ from typing import Any
 from uuid import uuid4
 
 from numba.core import caching, config
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.dispatcher import Dispatcher
 
 from landscape.errors import InputError
 
@@ -86,6 +89,19 @@ def keep_kernels(register_bits: int) -> None:
     """Make Numba use the cache; to be called before the first kernel is defined."""
     config.CACHE_DIR = str(kernel_folder(register_bits))  # pyright: ignore[reportAttributeAccessIssue]
     caching.IndexDataCacheFile = _CacheFile  # pyright: ignore[reportAttributeAccessIssue]
+    Dispatcher.compile = _compile
+
+
+def _compile(self: Any, sig: Any, at_once: Any = Dispatcher.compile) -> Any:
+    """Numba's, but that a kernel which another process compiles is waited for, alone, and then found.  It is locked before
+    those that it calls, and by the thread that has Numba's own lock: no two wait for each other."""
+    with global_compiler_lock, ExitStack() as locked:
+        if cache := getattr(self._cache, "_cache_file", None):  # a formula has none
+            with suppress(OSError):  # no room for the lock, or a file system without any
+                lock = os.open(f"{cache._index_path}.lock", os.O_RDWR | os.O_CREAT)
+                locked.callback(os.close, lock)
+                flock(lock, LOCK_EX)
+        return at_once(self, sig)
 
 
 class _CacheFile(caching.IndexDataCacheFile):

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from splat.training.checkpoint import load_checkpoint
 def small(monkeypatch):
     monkeypatch.setattr("analysis.commands.demo.SCENE", SyntheticSettings(gaussians=60, views=5, width=24, height=18))
     monkeypatch.setattr("analysis.commands.demo.ITERATIONS", 12)
-    monkeypatch.setattr("analysis.console.recording.draw", lambda module, target: [])
+    monkeypatch.setattr("analysis.commands.demo.drawing", lambda module: nullcontext(lambda target: []))
 
 
 def test_the_demo_makes_a_scene_trains_probes_and_says_what_to_open(small, tmp_path, capsys):
@@ -44,7 +45,7 @@ def test_the_demo_makes_a_scene_trains_probes_and_says_what_to_open(small, tmp_p
 
 def test_an_interrupted_demo_is_continued_where_it_was(small, tmp_path, capsys, monkeypatch):
     whole, out, presses, probed = tmp_path / "whole", tmp_path / "demo", [], []
-    monkeypatch.setattr("analysis.commands.demo.run_probe", lambda options, _: probed.append(options.checkpoint) or 0)
+    monkeypatch.setattr("analysis.commands.demo.run_probe", lambda options, *_: probed.append(options.checkpoint) or 0)
 
     def press(*given):
         presses.append(1)
