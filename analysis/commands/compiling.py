@@ -4,9 +4,10 @@ import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import Any
 
 import torch
-from numba.core import config, event
+from numba.core import config, event, registry
 from rich.console import Console
 
 from splat.curvature.hessian import SceneHessian
@@ -42,7 +43,12 @@ def compile_ahead() -> None:
     """Fork what compiles a probe's kernels, once in a cache, where a processor is left for it; it ends with this process."""
     done, parent = f"{config.CACHE_DIR}/of-a-probe", os.getpid()  # pyright: ignore[reportAttributeAccessIssue]
     with suppress(OSError, AttributeError):  # no room for a process; not Linux.  Commands on a GPU need few kernels
-        if len(os.sched_getaffinity(0)) == 1 or os.path.exists(done) or torch.cuda.is_available() or os.fork():
+        wanted = len(os.sched_getaffinity(0)) > 1 and not os.path.exists(done) and not torch.cuda.is_available()
+        if not wanted:
+            return
+        context: Any = registry.cpu_target.target_context
+        context.refresh()  # what Numba does once, before its first compilation
+        if os.fork():
             return
         try:
             ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL

@@ -93,9 +93,8 @@ def keep_kernels(register_bits: int) -> None:
 
 
 def _compile(self: Any, sig: Any, at_once: Any = Dispatcher.compile) -> Any:
-    """Numba's, but that a kernel which another process compiles is waited for, alone, and then found.  It is locked before
-    those that it calls, and by the thread that has Numba's own lock: no two wait for each other."""
-    with global_compiler_lock, ExitStack() as locked:
+    """Numba's; a kernel that another process compiles is waited for.  Callers are locked first: no two wait for each other."""
+    with global_compiler_lock, ExitStack() as locked:  # one thread of each process
         if cache := getattr(self._cache, "_cache_file", None):  # a formula has none
             with suppress(OSError):  # no room for the lock, or a file system without any
                 lock = os.open(f"{cache._index_path}.lock", os.O_RDWR | os.O_CREAT)
