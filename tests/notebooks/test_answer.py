@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 from scipy.stats import kendalltau, t
 
-from landscape.errors import InputError
 from notebooks.paper.figures import RESULTS
 from notebooks.paper.found import PAGE, lines, make, page
 from notebooks.paper.statements import judgements
@@ -20,6 +19,7 @@ from notebooks.prediction.switches import switch_effects
 from splat.model.untrusted import read_table
 from tests.notebooks.test_claims import PAPER
 from tests.notebooks.test_claims import made_up as paper
+from tests.refusals import refused
 
 ROOT = Path(__file__).parents[2]
 SIGNS = [dict(zip("abcde", signs)) for signs in product((-1, 1), repeat=5)]
@@ -226,5 +226,4 @@ def test_the_page_and_readme_say_what_the_stored_tables_give():
 
 def test_another_table_is_refused(tmp_path):
     (tmp_path / "prediction.csv").write_text("scene,cell\nfern,a\n")
-    with pytest.raises(InputError, match="expected the table of notebooks"):
-        read_prediction(Path(tmp_path / "prediction.csv"))
+    refused("expected the table of notebooks", read_prediction, Path(tmp_path / "prediction.csv"))

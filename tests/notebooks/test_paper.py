@@ -5,12 +5,12 @@ import pandas as pd
 import pytest
 
 from figures import uses
-from landscape.errors import InputError
 from notebooks.paper.__main__ import main
 from notebooks.paper.figures import AXES, captions, draw_axes, draw_budget, draw_index, method_words
 from notebooks.paper.predictors import predictors
 from notebooks.paper.statements import judgements
 from tests.notebooks.test_claims import NAMES, OTHERWISE, PAPER, made_up
+from tests.refusals import refused
 
 
 def test_captions_change_with_the_numbers():
@@ -75,5 +75,4 @@ def test_a_table_that_is_none_of_a_study_is_refused_in_a_sentence(tmp_path, caps
 
 
 def test_a_folder_without_results_of_the_uses_is_refused(tmp_path):
-    with pytest.raises(InputError, match="expected what landscape prune --curve, next-view or uncertainty writes"):
-        uses.draw(tmp_path)
+    refused("expected what landscape prune --curve, next-view or uncertainty writes", uses.draw, tmp_path)

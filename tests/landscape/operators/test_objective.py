@@ -215,8 +215,7 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_parameters_of_other_kinds_are_refused(kind):
     point, sentence = KINDS[kind]
-    with pytest.raises(InputError, match=sentence):
-        ObjectiveHessian(lambda parts: sum((part**2).sum() for part in parts.values()), point)  # pyright: ignore
+    refused(sentence, ObjectiveHessian, lambda parts: sum((part**2).sum() for part in parts.values()), point)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.complex64])

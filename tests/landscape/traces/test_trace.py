@@ -9,7 +9,7 @@ from landscape.operators.operator import CountingOperator, DenseOperator
 from landscape.traces.trace import PAPER, TraceSettings, estimate_traces
 from tests.landscape.spectra import Buffered
 from tests.oracles import symmetric_matrix
-from tests.refusals import misused
+from tests.refusals import misused, refused
 
 N = 40
 BLOCKS = {"a": slice(0, 12), "b": slice(12, 13), "c": slice(13, N)}
@@ -154,15 +154,12 @@ def test_products_that_are_not_finite_are_an_error_that_names_the_block():
 
 def test_bad_settings_are_refused():
     misused("min_probes <= max_probes", TraceSettings, min_probes=10, max_probes=5)
-    with pytest.raises(ValueError, match="'rademacher' or 'gaussian'"):
-        TraceSettings(distribution="uniform")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="'block' or 'full'"):
-        TraceSettings(reading="half")  # pyright: ignore[reportArgumentType]
+    refused("'rademacher' or 'gaussian'", TraceSettings, distribution="uniform")
+    refused("'block' or 'full'", TraceSettings, reading="half")
     misused("rtol, atol >= 0", TraceSettings, rtol=-1)
     misused("expected 8 <= min_probes", TraceSettings.fixed, 7)
     misused(r"max_probes >= 24 with the method 'hutch[+][+]'", TraceSettings.fixed, 23, method="hutch++")
-    with pytest.raises(ValueError, match=r"'auto', 'hutchinson', 'hutch[+][+]' or 'xtrace', got 'exact'"):
-        TraceSettings(method="exact")  # pyright: ignore[reportArgumentType]
+    refused(r"'auto', 'hutchinson', 'hutch[+][+]' or 'xtrace', got 'exact'", TraceSettings, method="exact")
     misused("reading 'block' with the method 'xtrace'", TraceSettings, method="xtrace", reading="full")
     misused("memory > 0", TraceSettings, memory=0.0)
     with pytest.raises(ValueError, match="blocks out of a, b, c, got 'd'"):

@@ -65,5 +65,4 @@ def test_each_of_a_machines_processes_takes_a_gpu_of_its_own_and_too_few_are_one
 
 
 def test_an_unknown_device_is_refused():
-    with pytest.raises(ValueError, match="expected the device 'auto', 'cpu' or 'cuda', got 'gpu'"):
-        device_named("gpu")  # pyright: ignore[reportArgumentType]
+    refused("expected the device 'auto', 'cpu' or 'cuda', got 'gpu'", device_named, "gpu")

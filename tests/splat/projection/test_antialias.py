@@ -143,5 +143,4 @@ def test_widths_are_one_for_each_gaussian_and_not_negative():
     refused("expected 4 filter widths", gaussians.with_filter, torch.zeros(3))
     with pytest.raises(InputError, match=r"non-negative filter_widths, got -1\.0 at Gaussian 2"):
         gaussians.with_filter(torch.tensor([0.0, 1.0, -1.0, 2.0])).require_finite()
-    with pytest.raises(InputError, match="'antialias': expected 'none' or 'mip'"):
-        RenderSettings(antialias="sharp")  # pyright: ignore[reportArgumentType]
+    refused("'antialias': expected 'none' or 'mip'", RenderSettings, antialias="sharp")

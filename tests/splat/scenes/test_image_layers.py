@@ -149,8 +149,7 @@ def test_a_folder_without_a_file_for_any_image_is_refused(tmp_path: Path, option
     with pytest.raises(FileNotFoundError, match=r"named after the 3 images, such as a\.png, in .*which is no folder"):
         load_scene(tmp_path, **{option: tmp_path / "nothing"})  # pyright: ignore[reportArgumentType]
     write_mask(tmp_path / "others/z.png", blob())
-    with pytest.raises(FileNotFoundError, match="found none"):
-        load_scene(tmp_path, **{option: tmp_path / "others"})  # pyright: ignore[reportArgumentType]
+    refused("found none", load_scene, tmp_path, **{option: tmp_path / "others"}, error=FileNotFoundError)
 
 
 def test_depth_maps_keep_their_numbers_at_any_scale_of_the_picture(tmp_path: Path) -> None:

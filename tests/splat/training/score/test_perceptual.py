@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from splat.training.score.evaluate import MissingPerceptual, load_lpips
+from tests.refusals import refused
 
 
 class Network(nn.Module):
@@ -53,8 +54,7 @@ def test_an_image_too_small_for_the_network_has_no_distance(monkeypatch: pytest.
 
 def test_without_the_package_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lpips", None)  # an import of it fails
-    with pytest.raises(MissingPerceptual, match=r"^LPIPS is left out: .*lpips.*pip install -e '\.\[lpips\]'$"):
-        load_lpips()
+    refused(r"^LPIPS is left out: .*lpips.*pip install -e '\.\[lpips\]'$", load_lpips, error=MissingPerceptual)
 
 
 @pytest.mark.parametrize("error", [URLError("no route"), RuntimeError("invalid hash value")])
@@ -63,8 +63,7 @@ def test_weights_that_cannot_be_fetched_are_said_so(monkeypatch: pytest.MonkeyPa
         raise error
 
     install(monkeypatch, network)
-    with pytest.raises(MissingPerceptual, match=r"^LPIPS is left out: the weights .*(no route|hash).*; fetch them"):
-        load_lpips()
+    refused(r"^LPIPS is left out: the weights .*(no route|hash).*; fetch them", load_lpips, error=MissingPerceptual)
 
 
 def test_a_torchvision_that_does_not_fit_torch_is_a_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,5 +71,4 @@ def test_a_torchvision_that_does_not_fit_torch_is_a_missing_package(monkeypatch:
         raise RuntimeError("operator torchvision::nms does not exist")
 
     monkeypatch.setattr("splat.training.score.evaluate.import_module", fail)
-    with pytest.raises(MissingPerceptual, match="torchvision::nms does not exist; to have it, install"):
-        load_lpips()
+    refused("torchvision::nms does not exist; to have it, install", load_lpips, error=MissingPerceptual)
