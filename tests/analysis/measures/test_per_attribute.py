@@ -4,7 +4,7 @@ import copy
 import io
 import re
 from contextlib import nullcontext
-from dataclasses import astuple, replace
+from dataclasses import astuple
 from html.parser import HTMLParser
 from itertools import product
 from pathlib import Path
@@ -36,10 +36,9 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from splat.training.adam import Adam
-from splat.training.checkpoint import load_checkpoint, save_checkpoint
-from splat.training.densify import ScreenGradients
+from splat.training.checkpoint import load_checkpoint
 from splat.training.origin.subject import Checkpoint
+from tests.analysis.probe.probed import save_double
 from tests.recorded import soft
 
 SCENE = SyntheticSettings(gaussians=50, views=4, width=16, height=12)
@@ -55,12 +54,9 @@ def path(tmp_path_factory) -> Path:
     write_transforms_scene(synthetic_scene(SCENE).scene, folder / "still")
     command = ["train", str(folder / "still"), "--out", str(folder / "run"), "--iterations", "10", "--no-densify"]
     assert main([*command, "--sh-degree", "1"]) == 0
-    loaded = load_checkpoint(folder / "run" / "checkpoint.pt")
-    gaussians = loaded.training.gaussians.select(torch.arange(len(loaded.training.gaussians)), 1).to(torch.float64)
-    state = Adam.zero(gaussians), ScreenGradients.zero(len(gaussians), torch.float64)
-    training = replace(loaded.training, gaussians=gaussians, adam=state[0], screen_gradients=state[1])
-    save_checkpoint(folder / "run" / "double.pt", training, loaded.scene)
-    return folder / "run" / "double.pt"
+    double = folder / "run" / "double.pt"
+    save_double(folder / "run" / "checkpoint.pt", double, lambda g: g.select(torch.arange(len(g)), 1))
+    return double
 
 
 @pytest.fixture(scope="module")

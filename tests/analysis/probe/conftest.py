@@ -1,7 +1,6 @@
 """A checkpoint that was probed, and its dense Hessian: made once, for all tests of this folder."""
 
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,10 +11,8 @@ from analysis.records.records import Record
 from splat.render.render import render
 from splat.scenes.synthetic import synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from splat.training.adam import Adam
-from splat.training.checkpoint import load_checkpoint, save_checkpoint
-from splat.training.densify import ScreenGradients
-from tests.analysis.probe.probed import SCENE, unlimited
+from splat.training.checkpoint import load_checkpoint
+from tests.analysis.probe.probed import SCENE, save_double, unlimited
 from tests.splat.photometric import photometric_loss
 
 
@@ -27,11 +24,7 @@ def run(tmp_path_factory) -> Path:
     out = folder / "run"
     settings = ["--iterations", "30", "--no-densify", "--sh-degree", "1"]
     assert main(["train", str(folder / "still"), "--out", str(out), *settings]) == 0
-    loaded = load_checkpoint(out / "checkpoint.pt")
-    gaussians = loaded.training.gaussians.to(torch.float64)
-    state = Adam.zero(gaussians), ScreenGradients.zero(len(gaussians), torch.float64)
-    training = replace(loaded.training, gaussians=gaussians, adam=state[0], screen_gradients=state[1])
-    save_checkpoint(out / "double.pt", training, loaded.scene)
+    save_double(out / "checkpoint.pt", out / "double.pt")
     return out
 
 

@@ -21,27 +21,16 @@ from figures.plane import plane
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
-from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.synthetic import synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from splat.training.adam import Adam
-from splat.training.checkpoint import load_checkpoint, open_subject, save_checkpoint
-from splat.training.densify import ScreenGradients
+from splat.training.checkpoint import load_checkpoint, open_subject
 from splat.training.origin.fingerprint import Fingerprint
+from tests.analysis.probe.probed import SCENE, save_double
 from tests.recorded import soft, synthetic, synthetic_line, written
 
 ROOT = Path(__file__).parents[3]
-SCENE = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
 POINTS = ["--points", "9", "--all-points"]
 EPS = np.finfo(np.float64).eps
-
-
-def save_double(checkpoint: Path, out: Path, change=lambda gaussians: gaussians) -> None:
-    """The checkpoint in double precision, with other Gaussians."""
-    loaded = load_checkpoint(checkpoint)
-    gaussians = change(loaded.training.gaussians.to(torch.float64))
-    state = Adam.zero(gaussians), ScreenGradients.zero(len(gaussians), torch.float64)
-    training = replace(loaded.training, gaussians=gaussians, adam=state[0], screen_gradients=state[1])
-    save_checkpoint(out, training, loaded.scene)
 
 
 def behind(gaussians: Gaussians) -> Gaussians:
@@ -242,9 +231,7 @@ def test_an_adaptive_slice_says_what_it_rendered(run, objective, tmp_path, capsy
     assert str(tmp_path / "slice") in said.out and "slice.json" in said.out
 
 
-def test_an_interrupted_slice_leaves_the_old_record_says_how_it_is_continued_and_continues(
-    run, eigen, tmp_path, monkeypatch, capsys
-):
+def test_an_interrupted_slice_keeps_the_old_record_says_how_to_go_on_and_can(run, eigen, tmp_path, monkeypatch, capsys):
     out = shutil.copytree(eigen.folder, tmp_path / "slice")
     before, evaluate, calls = (out / "slice.json").read_bytes(), SceneObjective.evaluate, []
 
