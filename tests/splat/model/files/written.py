@@ -11,6 +11,7 @@ import struct
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -59,6 +60,12 @@ def brush(gaussians: Gaussians) -> bytes:
     order = sorted(found, key=lambda name: rank.get(name.rpartition("_")[0] or name, -1))
     comments = ("Exported from Brush", "SH degree: 3", "SplatRenderMode: default")
     return ply({name: found[name] for name in order}, comments)
+
+
+def stored(path: Path, content: bytes) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    return path
 
 
 def saved(content: object) -> bytes:

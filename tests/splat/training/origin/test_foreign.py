@@ -31,6 +31,7 @@ from splat.training.origin.subject import Checkpoint, SceneReference
 from splat.training.state import TrainConfig, Training
 from tests.refusals import refused
 from tests.splat.model.files import written
+from tests.splat.model.files.written import stored
 
 OURS = "splat-landscape"
 MADE = synthetic_scene(SyntheticSettings(gaussians=60, views=12, width=24, height=16))
@@ -52,12 +53,6 @@ def folder(tmp_path) -> Path:
 def opened(path: Path, train: Sequence[str] | None = None, **ask) -> Checkpoint:
     ask = {"scene": path.parents[0] / "scene", "guess_views": True, **ask}
     return open_checkpoint(path, Foreign(**ask), path, train)
-
-
-def stored(path: Path, content: bytes) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content)
-    return path
 
 
 def own(path: Path, scene: Path) -> Path:
@@ -326,9 +321,7 @@ TRAINED = {"opacity_reg": "trained", "scale_reg": "trained"}
         ("ckpts/cfg_args", "Namespace(cap_max=9)", {}, (0.2, 0.0, 0.0), "--opacity-reg 0.01 --scale-reg 0.01 adds"),
     ],
 )
-def test_regularisers_are_in_the_loss_when_asked_for_else_said_to_be_missing(
-    folder, settings, text, ask, expected, said
-):
+def test_regularisers_are_in_the_loss_when_asked_for_or_said_to_be_missing(folder, settings, text, ask, expected, said):
     path = stored(folder / "run/ckpts/a.ply", written.ply(written.columns(gaussians())))
     stored(folder / "run" / settings, text.encode())
     found = opened(path, scene=folder / "scene", trained_by="gsplat-raw", **ask)
