@@ -44,9 +44,7 @@ def until(browser: Any, condition: str, seconds: float = PATIENCE) -> Any:
     """What a condition in JavaScript comes to as soon as it holds."""
     from selenium.webdriver.support.ui import WebDriverWait
 
-    return WebDriverWait(browser, seconds, 0.1).until(
-        lambda _: browser.execute_script(f"return {condition}"), condition
-    )
+    return WebDriverWait(browser, seconds, 0.1).until(lambda b: b.execute_script(f"return {condition}"), condition)
 
 
 def errors_in(browser: Any) -> list[str]:

@@ -39,16 +39,12 @@ def test_the_readme_is_short_and_every_page_and_notebook_is_listed():
     listed = set(re.findall(r"[\w-]+\.(?:md|ipynb)", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
     notebooks = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "notebooks").glob("*.ipynb")}
     assert not [name for name, text in notebooks.items() if "](../" in text]  # they lie in two folders
-    assert (
-        listed == {path.name for path in (ROOT / "docs").iterdir() if path.suffix in (".md", ".ipynb")} >= {*notebooks}
-    )
+    assert listed == {p.name for p in (ROOT / "docs").iterdir() if p.suffix in (".md", ".ipynb")} >= {*notebooks}
 
 
 def test_every_trainer_and_every_method_has_a_row_on_its_page():
     pages = {"other-tools": PRESETS, "methods": METHODS}
-    rows = {
-        page: re.findall(r"^\|(.*)", (ROOT / f"docs/{page}.md").read_text(encoding="utf-8"), re.M) for page in pages
-    }
+    rows = {page: re.findall(r"^\|(.*)", (ROOT / f"docs/{page}.md").read_text("utf-8"), re.M) for page in pages}
     assert not [name for page, names in pages.items() for name in names if f"`{name}`" not in "".join(rows[page])]
 
 

@@ -30,10 +30,8 @@ def packages(tmp_path_factory) -> Path:
 
 
 def run(folder: Path, packages: Path, *words: str) -> str:
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(packages)])}
-    done = subprocess.run(
-        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, timeout=240
-    )
+    paths = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(packages)])}
+    done = subprocess.run([sys.executable, *words], cwd=folder, env=paths, capture_output=True, text=True, timeout=240)
     return f"{done.returncode} {done.stdout} {done.stderr}"
 
 

@@ -82,9 +82,7 @@ def test_nothing_of_the_pages_is_cut_or_scrolls_sideways(browser, tmp_path, widt
         browser.find_element("css selector", "figure img").click()
         shown = "document.images[0].getBoundingClientRect().width"
         size = browser.execute_script(f"return [{shown} > 1000, document.documentElement.scrollWidth <= {width}]")
-        assert (
-            size == [True, True] and browser.execute_script("return document.querySelectorAll('.scroll').length") == 1
-        )
+        assert size == [True] * 2 and browser.execute_script("return document.querySelectorAll('.scroll').length") == 1
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
@@ -115,9 +113,7 @@ def test_a_click_a_field_and_a_step_reach_the_viewer(browser, viewer):
     ActionChains(browser).move_to_element_with_offset(canvas, -130, 0).click().perform()
     until(browser, "/Gaussian \\d+, \\d+% of this pixel/.test(document.body.innerText)")
     assert "largest curvature" in viewer.numbers.content
-    field = next(
-        each for each in browser.find_elements("tag name", "input") if "largest" in each.get_attribute("value")
-    )
+    field = next(x for x in browser.find_elements("tag name", "input") if "largest" in x.get_attribute("value"))
     field.click()
     field.send_keys("\ue009a")  # all of it
     field.send_keys("condition")

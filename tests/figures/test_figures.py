@@ -130,9 +130,8 @@ def test_titles_of_renders_along_an_end_stay_apart(tmp_path):
     end = json.loads((tmp_path / "map" / "map.json").read_text())["steepest"][0]
     end["carriers"] = [end["carriers"][0] | {"gaussian": 123456 + i, "share": 0.152} for i in range(5)]
     end |= {"step": 0.00373, "length": "1/32 × the optimiser's step", "losses": [0.07408, 0.0735, 0.07414]}
-    pictures = {name: np.zeros((126, 168, 3), np.uint8) for name in maps.END_MAPS} | {
-        "difference": np.zeros((126, 168), np.uint8)
-    }
+    pictures = {name: np.zeros((126, 168, 3), np.uint8) for name in maps.END_MAPS}
+    pictures["difference"] = np.zeros((126, 168), np.uint8)
     figure = maps.draw_steepest(pictures, convert(end, Steepest))
     require_apart(said := words(figure, laid_out(figure)))
     assert sum("(1/32 × the optimiser's step)" in text for text, _ in said) == 2
@@ -293,9 +292,7 @@ def test_ranges_that_are_alike_have_the_same_ticks(tmp_path, stretch, same):
     arrays["slice"]["x"] = np.linspace(-6.5, 6.5, 21)
     arrays["slice"]["y"] = np.linspace(-6.5, 6.5, 17) * stretch
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
-    first, second = (
-        each.get_xticks().tolist() for each in figure.axes if each.get_title(loc="left").startswith("Along")
-    )
+    first, second = (each.get_xticks().tolist() for each in figure.axes if each.get_title("left").startswith("Along"))
     assert (first == second) == same
 
 
@@ -324,9 +321,7 @@ def test_a_section_is_headed_by_how_far_its_curvature_holds(tmp_path, ratio, sai
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     titles = [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes]
     assert f"Along {data['slice']['directions'][0]['name']} the loss {said}" in titles
-    uppers = [
-        upper.get_xlabel() for axes in figure.axes for upper in axes.child_axes if isinstance(upper, SecondaryAxis)
-    ]
+    uppers = [top.get_xlabel() for axes in figure.axes for top in axes.child_axes if isinstance(top, SecondaryAxis)]
     assert uppers == [f"steps in curvature units,\n1: ΔL = {quantity(data['slice']['loss_scale'])}"] * 2
     assert all(
         handle.get_marker() != "None" or handle.get_linestyle() != "None"
@@ -406,12 +401,8 @@ def test_a_surface_marks_its_renders_and_has_true_proportions_or_says_that_it_ha
 
 def test_a_figure_from_the_command_line_and_its_refusal(tmp_path):
     folder = written(tmp_path / "probe", *synthetic()).folder
-    good, bad = (
-        subprocess.run(
-            [sys.executable, "-m", "figures.make_all", str(place), "--only", "traces"], capture_output=True, text=True
-        )
-        for place in (folder, tmp_path)
-    )
+    command = [sys.executable, "-m", "figures.make_all", "--only", "traces"]
+    good, bad = (subprocess.run([*command, str(at)], capture_output=True, text=True) for at in (folder, tmp_path))
     assert good.returncode == 0 and good.stdout.strip() == str(folder / "traces.png")
     with Image.open(folder / "traces.png") as picture:
         assert picture.width == round(COLUMN * 300)

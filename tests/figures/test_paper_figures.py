@@ -175,9 +175,8 @@ def test_a_largest_eigenvalue_that_renders_do_not_confirm_is_said_to_be_so(runs)
         written(run / "probe", data, arrays)
     first, second = (axes.get_title() for axes in fig1.draw(runs).axes if hasattr(axes, "get_zlim"))
     assert NOT_CONFIRMED not in first and NOT_CONFIRMED in second
-    assert surface._doubt(read_record(runs[0] / "probe")) == "" and NOT_CONFIRMED in surface._doubt(
-        read_record(runs[1] / "probe")
-    )
+    doubts = [surface._doubt(read_record(run / "probe")) for run in runs]
+    assert doubts[0] == "" and NOT_CONFIRMED in doubts[1]
 
 
 def test_sections_fill_their_axes(runs):

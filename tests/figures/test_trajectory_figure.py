@@ -64,9 +64,7 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
         assert np.asarray(lines[0].get_ydata()) == pytest.approx([scale * abs(i - 2.5) for i in (2, 3, 4)])
     smallest = panels["−λ min"]
     filled = [x for x in smallest.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) != "#ffffff"]
-    assert [float(y) for x in filled for y in np.asarray(x.get_ydata())] == pytest.approx(
-        [1 / 2, 1 / 3, 1 / 4, 3 / 2, 1, 3 / 4]
-    )
+    assert np.ravel([x.get_ydata() for x in filled]).tolist() == pytest.approx([1 / 2, 1 / 3, 1 / 4, 3 / 2, 1, 3 / 4])
     assert list(np.asarray(panels["Gaussians"].lines[0].get_ydata())) == [2000, 3000, 4000]
     assert "a: λ max × 2.0 from step 1,000 to 2,000" in figure.get_suptitle()
 
@@ -94,9 +92,7 @@ def test_a_number_that_is_0_within_round_off_is_left_off_the_logarithmic_axis():
 
 
 def test_a_bound_is_an_arrow_without_a_line(tmp_path):
-    axes = {each.get_title(): each for each in trajectory.draw(gathered([run(tmp_path / "a")])).axes}[
-        "participation ratio"
-    ]
+    axes = {x.get_title(): x for x in trajectory.draw(gathered([run(tmp_path / "a")])).axes}["participation ratio"]
     arrows = [x for x in axes.lines if x.get_marker() == trajectory.ARROW["marker"]]
     assert [float(y) for x in arrows for y in np.asarray(x.get_ydata())] == [10.0, 15.0, 20.0]
     lines = [x for x in axes.lines if x.get_linestyle() == "-"]

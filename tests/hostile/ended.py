@@ -95,9 +95,7 @@ class Ended:
         allowed = {-number, 0} if number == signal.SIGKILL else {-number, 128 + number, 0}
         assert code in allowed, f"exit code {code}"
         aside = self.out.with_name(f".{self.out.name}.previous")
-        assert not before or self.out.exists() or (number == signal.SIGKILL and aside.exists()), (
-            "what was there is gone"
-        )
+        assert not before or self.out.exists() or (number == signal.SIGKILL and aside.exists()), "nothing is left"
         if self.out.exists():
             self.check()
         self.run_to_its_end()

@@ -122,9 +122,7 @@ def test_gains_share_the_deviation_of_all_methods():
     """95% intervals of three seeds; alone they would be as wide as Student's with two degrees of freedom."""
     rng, covered, widths = np.random.default_rng(2), [], []
     for _ in range(100):
-        rows = pd.DataFrame(
-            {"scene": "fern", "method": np.repeat(["3dgs", *"abcdefg"], 3), "seed": np.tile(range(3), 8)}
-        )
+        rows = pd.DataFrame({"scene": "fern", "method": np.repeat(["3dgs", *"abcdefg"], 3), "seed": [0, 1, 2] * 8})
         rows["psnr"] = rng.standard_normal(24)
         found = gain(rows, "a")
         covered.append(found.low < 0 < found.high)
@@ -181,9 +179,7 @@ def test_quantities_that_most_runs_lack_are_left_out():
 
 def test_a_row_has_the_curvature_that_adams_steps_see(tmp_path):
     data, arrays = synthetic()
-    data["eigenvalues"]["max"]["lives_on"] = {
-        "participation": 1.1, "needles": 0.9, "needle_count": 3,
-    }  # fmt: skip
+    data["eigenvalues"]["max"]["lives_on"] = {"participation": 1.1, "needles": 0.9, "needle_count": 3}
     data["eigenvalues"]["max"] |= {"value": 4.0, "renders": {
         "confirmed": False, "optimiser_step": 1e-3, "steps": [1e-4, 1e-3], "ratios": [1.0, 0.5], "errors": [0.0, 0.1],
     }}  # fmt: skip
@@ -210,9 +206,7 @@ def test_a_map_of_a_run_adds_what_one_view_sees(tmp_path, monkeypatch):
     (tmp_path / "map" / "map.json").touch()
     row = module._of_map(tmp_path, "state")
     assert np.isnan(row.pop("depth_gradient"))
-    assert row == {
-        "opacity_one_view": 0.25, "needle_count": 0.1, "needles_quats": 0.6, "needles_log_scales": 0.5,
-    }  # fmt: skip
+    assert row == {"opacity_one_view": 0.25, "needle_count": 0.1, "needles_quats": 0.6, "needles_log_scales": 0.5}
 
 
 def test_ten_samples_suffice_where_the_largest_error_is_small():

@@ -90,9 +90,7 @@ def test_the_table_has_each_row_once_and_is_continued(tmp_path, monkeypatch):
     out.write_text(out.read_text().replace(first["end"]["digest"], "0" * 16))  # as if the training had been made again
     assert command.main([str(runs), "--out", str(out)]) == 0
     made_again = {row["at"]: row for row in rows_of(out) if row["seed"] == 0}["end"]
-    assert len(paths) > 4 and all(
-        made_again[name] == again["end"][name] for name in ("digest", "lambda_max", "ensemble")
-    )
+    assert len(paths) > 4 and all(made_again[key] == again["end"][key] for key in ("digest", "lambda_max", "ensemble"))
 
 
 def test_the_levels_are_those_of_the_sweep():

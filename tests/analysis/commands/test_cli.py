@@ -230,9 +230,7 @@ def test_settings_are_refused_before_folders_are_looked_into(tmp_path, capsys, o
 @pytest.mark.parametrize(
     "words", ["train SCENE", "probe a.ply --scene SCENE", "convert a.ply a.pt --scene=SCENE", "map SCENE"]
 )
-def test_a_scene_or_a_checkpoint_that_is_not_there_is_refused_before_libraries_are_loaded(
-    tmp_path, capsys, monkeypatch, words
-):
+def test_a_scene_or_checkpoint_that_is_not_there_is_refused_before_libraries_load(tmp_path, capsys, monkeypatch, words):
     monkeypatch.setattr("analysis.commands.cli.import_module", lambda name: pytest.fail(f"{name} is loaded"))
     kind = "a checkpoint written by landscape train at" if words.startswith("map") else "a scene folder,"
     assert main(words.replace("SCENE", str(tmp_path / "gone")).split()) == 2

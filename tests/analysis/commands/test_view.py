@@ -145,9 +145,8 @@ def test_a_pick_is_outlined_and_lists_the_field_shown_first(viewer, objective):
     ring, at = (axes[index].double() for axes in (viewer.frame.axes(objective.active), objective.active.means))
     distance = torch.tensor(viewer.frame.outline(objective.active, index)) - torch.tensor(viewer.frame.place(at))
     assert torch.linalg.norm(torch.linalg.solve(ring, distance.mT), dim=1).sub(view.OUTLINE).abs().max() < 1e-9
-    viewer.click(
-        viewer.frame.place(objective.views[0].camera.centre).tolist(), (-objective.views[0].camera.forward).tolist()
-    )
+    place, forward = _ray(viewer, objective)
+    viewer.click(place, [-x for x in forward])
     assert not viewer.mark.visible and viewer.numbers.content == "Nothing there."
 
 

@@ -89,9 +89,7 @@ def test_what_a_terminal_obeys_is_never_printed(capsys, evil):
     ("name", "value"),
     [("NUMBA_NUM_THREADS", "0"), ("NUMBA_NUM_THREADS", "-1"), ("NUMBA_DISABLE_JIT", "1"), ("NUMBA_OPT", "0")],
 )
-def test_settings_with_which_nothing_or_something_else_compiles_are_refused_in_a_sentence(
-    monkeypatch, capsys, name, value
-):
+def test_settings_with_which_nothing_or_something_else_compiles_are_refused(monkeypatch, capsys, name, value):
     monkeypatch.setenv(name, value)
     assert cli.main(["probe", "nowhere"]) == 2
     (line,) = capsys.readouterr().err.splitlines()

@@ -23,9 +23,7 @@ LOSS = LossSettings("charbonnier")
 def test_the_exact_product_agrees_with_the_gradient_of_the_views_compared(views) -> None:
     hessian = SceneHessian(SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LOSS, BACKGROUND))
     counted: list[int] = []
-    check = check_against_gradient(
-        hessian, torch.Generator().manual_seed(0), lambda done, *_: counted.append(done), views
-    )
+    check = check_against_gradient(hessian, torch.Generator().manual_seed(0), lambda n, *_: counted.append(n), views)
     assert check.error < 1e-4 and check.rounding == 0 and counted
 
 

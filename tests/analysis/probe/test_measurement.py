@@ -51,9 +51,7 @@ def test_the_blocks_of_the_gaussians_are_made_once(monkeypatch):
 
 
 def test_the_slices_model_has_the_hessian_between_its_directions():
-    objective = SceneObjective(
-        random_gaussians(15, 1, logit=1.0).to(torch.float64), two_views(), LossSettings(), BACKGROUND.double()
-    )
+    objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND.double())
     settings = replace(ProbeSettings.quick(), slice_points=5)
     found = measure(objective, settings, steps(objective), torch.Generator().manual_seed(0), Stages())
     assert found.plane is not None and found.plane.slice.curvature is not None
@@ -81,9 +79,7 @@ def test_a_search_begun_with_several_directions_finds_the_ends():
 
 
 def test_the_paper_s_power_iteration_is_read_from_the_density_without_products():
-    objective = SceneObjective(
-        random_gaussians(15, 1, logit=1.0).to(torch.float64), two_views(), LossSettings(), BACKGROUND.double()
-    )
+    objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND.double())
     seen = []
     settings = replace(ProbeSettings(), slice_points=5, traces=TraceSettings(rtol=0.3), depth=None, density_matvecs=48)
     draw = measurement.spectral_density

@@ -77,9 +77,7 @@ def test_in_an_open_bracket_a_power_iteration_that_ran_out_did_not_arrive():
         torch.Generator(),
     )
     ends = extreme_eigenpairs(operator, generator.manual_seed(0), EigenSettings(max_matvecs=7))
-    late, arrived = (
-        power_ends(operator, generator, PowerSettings(0.1, atol=1e-2, max_matvecs=steps)) for steps in (2, 3000)
-    )
+    late, arrived = (power_ends(operator, generator, PowerSettings(0.1, atol=1e-2, max_matvecs=n)) for n in (2, 3000))
     index = paper_index(ends, late)
     assert index.high is None and index.note.startswith("by Lanczos: the paper's power iteration did not arrive")
     assert paper_index(ends, arrived).note.startswith("by power iteration")

@@ -106,13 +106,9 @@ def test_a_quick_probe_says_what_it_left_out_and_the_files_to_open(run, capsys, 
 
 def test_a_quick_probe_leaves_out_the_same_pictures_however_it_is_started(run, tmp_path, monkeypatch):
     begun, drawn = [], []
-    monkeypatch.setattr(
-        "analysis.console.drawing.drawing", lambda *told: begun.append(told) or nullcontext(lambda target: [])
-    )
+    monkeypatch.setattr("analysis.console.drawing.drawing", lambda *of: begun.append(of) or nullcontext(lambda _: []))
     assert main(["probe", str(run / "checkpoint.pt"), "--quick", "--out", str(tmp_path / "command")]) == 0
-    monkeypatch.setattr(
-        "analysis.console.recording.draw", lambda module, target, *told: drawn.append((module, *told)) or []
-    )
+    monkeypatch.setattr("analysis.console.recording.draw", lambda module, _, *told: drawn.append((module, *told)) or [])
     assert run_probe(ProbeOptions(run / "checkpoint.pt", quick=True, out=tmp_path / "function")) == 0
     assert begun == drawn == [("make_all",)]
 

@@ -227,9 +227,8 @@ with record_folder(sys.argv[1]) as partial:
 
 def test_a_process_killed_while_it_writes_leaves_the_old_record_whole(tmp_path, request):
     folder = written(tmp_path / "probe")
-    process = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(folder), str(request.config.rootpath)], stdout=subprocess.PIPE, text=True
-    )
+    command = [sys.executable, "-c", KILLED, str(folder), str(request.config.rootpath)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None and process.stdout.readline() == "written\n"
     process.send_signal(signal.SIGKILL)
     process.wait()

@@ -37,9 +37,7 @@ class Page(HTMLParser):
         self.tags.append(tag)
         self.open.append(tag)
         self.scripts += tag == "script"
-        self.addresses += [
-            value for key, value in attrs if key in {"src", "href", "srcset", "data", "action", "poster"}
-        ]
+        self.addresses += [v for k, v in attrs if k in {"src", "href", "srcset", "data", "action", "poster"}]
         if tag in {"meta", "link", "img", "br"}:
             self.open.pop()
 
@@ -304,9 +302,7 @@ def test_a_failed_check_comes_first_and_in_red(tmp_path):
         ("eigenvalue_ratio", {}, "noise floor", None),
     ],
 )
-def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_resolves_it(
-    tmp_path, index, settings, reason, command
-):
+def test_a_number_without_finite_bracket_is_none_and_names_what_resolves_it(tmp_path, index, settings, reason, command):
     data, arrays = synthetic()
     data["anisotropy"][index] = {"value": 0.73519, "low": 0.5, "high": None, "note": "open"}
     data["eigenvalues"]["min"] |= {"reason": reason, "matvecs": 15}

@@ -192,9 +192,7 @@ def test_other_trackers_are_given_the_rows_by_the_calls_that_they_share(original
         (["--log-every", "0"], "expected log_every of at least 1, got 0"),
     ],
 )
-def test_what_cannot_be_done_is_refused_before_there_is_a_folder(
-    original, tmp_path, capsys, monkeypatch, more, message
-):
+def test_what_cannot_be_done_is_refused_before_a_folder_is_made(original, tmp_path, capsys, monkeypatch, more, message):
     for name in ("torch.utils.tensorboard", "trackio"):
         monkeypatch.setitem(sys.modules, name, None)
     assert main(words(original, tmp_path / "run", *more)) == 2

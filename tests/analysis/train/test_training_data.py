@@ -76,9 +76,7 @@ def lpips(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize(("views", "number"), [(None, 2), (3, 3), ("all", 4)])
-def test_the_number_of_training_views_is_the_protocols_where_nobody_says_one(
-    original, tmp_path, monkeypatch, views, number
-):
+def test_the_number_of_views_is_the_protocols_where_nobody_says_one(original, tmp_path, monkeypatch, views, number):
     monkeypatch.setattr("analysis.train.command.usual_views", lambda scene: 2)
     _, split, *_ = planned(TrainOptions(original, views=views), tmp_path / "run")
     assert len(split.train) == number
@@ -151,9 +149,7 @@ def test_a_world_far_from_its_origin_is_planned_near_it_and_loaded_again_as_it_w
     assert planned(TrainOptions(original, views=2), tmp_path / "run")[3].similarity is None
 
 
-def test_without_lpips_the_metric_is_null_in_the_record_and_the_help_says_how_to_have_it(
-    original, tmp_path, capsys, monkeypatch
-):
+def test_without_lpips_the_metric_is_null_and_the_help_says_how_to_have_it(original, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "lpips", None)
     assert train(original, tmp_path / "run") == 0
     said = capsys.readouterr().out

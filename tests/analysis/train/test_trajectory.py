@@ -164,9 +164,7 @@ def test_quick_records_are_all_coarse_and_none_is_left_out(scene):
     assert known == [len(table), 0]
 
 
-def test_a_record_of_which_nothing_can_be_measured_says_why_and_whole_numbers_stay_so(
-    at_the_end, tmp_path, monkeypatch
-):
+def test_a_record_where_nothing_can_be_measured_says_why_and_whole_numbers_stay_so(at_the_end, tmp_path, monkeypatch):
     training, views, _, reference = at_the_end
     along = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY), reference)
     along.after_step()

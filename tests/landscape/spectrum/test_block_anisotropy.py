@@ -33,9 +33,7 @@ def test_every_parts_brackets_hold_the_indices_of_its_own_dense_block(name):
         total, indices = float(true.abs().sum()), found[part].indices
         assert indices.top_mass is not None and indices.participation_ratio is not None
         assert indices.top_mass.low <= float(true[-1]) / total <= indices.top_mass.high
-        assert (
-            indices.participation_ratio.low <= total**2 / float(true.square().sum()) <= indices.participation_ratio.high
-        )
+        assert indices.participation_ratio.low <= total**2 / true.square().sum() <= indices.participation_ratio.high
         assert found[part].rank == rows.stop - rows.start
 
 
@@ -98,9 +96,7 @@ def test_a_part_is_led_to_its_ends():
 @pytest.mark.parametrize("size", [2.0**531, 2.0**-664])
 def test_indices_do_not_depend_on_the_size_of_the_numbers(size):
     """1e160 and 1e-200: powers of two, which round nothing off."""
-    one, other = (
-        block_anisotropy(DenseOperator(scale * operator("both tails").matrix), generator()) for scale in (1.0, size)
-    )
+    one, other = (block_anisotropy(DenseOperator(c * operator("both tails").matrix), generator()) for c in (1.0, size))
     assert other.ends.noise == pytest.approx(size * one.ends.noise, rel=1)
     for index, scaled in zip(vars(one.indices).values(), vars(other.indices).values(), strict=True):
         assert [scaled.value, scaled.low, scaled.high] == pytest.approx([index.value, index.low, index.high], rel=1e-9)

@@ -179,9 +179,7 @@ def test_the_matvecs_counted_are_those_that_were_needed():
 
 def test_progress_ends_at_starts_times_steps():
     seen = []
-    spectral_density(
-        operator("indefinite"), generator(), 15, 3, batch=2, progress=lambda *state: seen.append(state[:2])
-    )
+    spectral_density(operator("indefinite"), generator(), 15, 3, batch=2, progress=lambda *at: seen.append(at[:2]))
     assert seen == sorted(seen) and seen[-1] == (15, 15)
 
 
@@ -208,7 +206,5 @@ def test_bad_settings_are_refused():
 @pytest.mark.parametrize("share", [0.1, 0.3, 1 / 3])
 def test_equal_values_whose_weights_round_have_an_interval_of_round_off(share):
     weights = torch.tensor([[share, share, 1 - 2 * share], [share, 1 - share, 0.0]], dtype=torch.float64)
-    found = SpectralDensity(torch.full((2, 3), 2.0, dtype=torch.float64), weights, dim=98, matvecs=6).integral(
-        torch.abs
-    )
+    found = SpectralDensity(torch.full((2, 3), 2.0).double(), weights, dim=98, matvecs=6).integral(torch.abs)
     assert found.low <= 196 <= found.high and found.high - found.low < 1e-10

@@ -76,6 +76,4 @@ def test_intervals_of_the_default_cover_where_probes_become_a_sketch(settings):
     H, seeds = matrix("1/i^2"), 250
     estimates = [estimate_traces(DenseOperator(H), generator(s), settings)["all"] for s in range(seeds)]
     assert sum(e.method == "xtrace" for e in estimates) > 0.9 * seeds
-    assert abs(sum(e.low <= float(H.trace()) <= e.high for e in estimates) / seeds - 0.95) < 4 * sqrt(
-        0.05 * 0.95 / seeds
-    )
+    assert abs(sum(e.low <= H.trace() <= e.high for e in estimates) / seeds - 0.95) < 4 * sqrt(0.05 * 0.95 / seeds)

@@ -127,9 +127,7 @@ def test_traces_of_exact_blocks_are_within_the_error_of_sampled_ones() -> None:
     approximate = objective.block_diagonal(approximate=True).traces(objective.active.quats)
     for name, estimate in sampled.items():
         assert abs(exact[name] - estimate.value) < 4 * estimate.standard_error
-    assert any(
-        abs(approximate[name] - estimate.value) > 4 * estimate.standard_error for name, estimate in sampled.items()
-    )
+    assert any(abs(approximate[name] - found.value) > 4 * found.standard_error for name, found in sampled.items())
 
 
 def test_memory_decides_which_views_are_kept_and_changes_no_bit(monkeypatch) -> None:

@@ -236,9 +236,7 @@ def test_a_view_that_draws_no_moved_gaussian_is_left_out_exactly(gauss_newton, m
         part[behind[scene.mask]] = 1
     made, kind = [], "ggn" if gauss_newton else "hvp"
     whole = getattr(LinearizedView, kind)
-    monkeypatch.setattr(
-        LinearizedView, kind, lambda view, *given, **how: made.append(view) or whole(view, *given, **how)
-    )
+    monkeypatch.setattr(LinearizedView, kind, lambda view, *more, **how: made.append(view) or whole(view, *more, **how))
     for columns, products in ((U, 2), (U * only_behind.flat[:, None], 1), (torch.zeros_like(U), 0)):
         made.clear()
         product = hessian.apply(columns)

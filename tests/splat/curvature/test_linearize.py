@@ -129,9 +129,7 @@ def test_gauss_newton_is_the_dense_product_of_its_three_factors(loss, mode):
     gaussians, view = filtered(random_gaussians(4, 1, logit=1.0, spread=0.4), mode), two_views(7, 6)[0]
     held = hold(gaussians, view, loss, settings=MODES[mode])
     identity = torch.eye(gaussians.flat.numel(), dtype=torch.float64)
-    J = torch.autograd.functional.jacobian(
-        lambda flat: image_and_alpha(gaussians, view, flat, MODES[mode]), gaussians.flat
-    )
+    J = torch.autograd.functional.jacobian(lambda x: image_and_alpha(gaussians, view, x, MODES[mode]), gaussians.flat)
     assert relative_error(held.jvp(identity), J.movedim(-1, 0)) < 1e-12  # pyright: ignore
     cotangents = random_like((2, 4, 6, 7), 1)
     assert relative_error(held.vjp(cotangents), torch.einsum("chwp,kchw->pk", J, cotangents)) < 1e-12

@@ -85,9 +85,7 @@ def test_blocks_and_traces_are_those_of_the_dense_hessian_and_gauss_newton_has_n
     diagonal = exact.diagonals
     torch.testing.assert_close(diagonal["opacity_logits"][:, 0], H.diagonal()[logits], rtol=1e-10, atol=1e-14)
     assert torch.equal(gauss_newton.geometry, bare.exact_blocks[1].geometry)
-    assert torch.equal(
-        *(SceneHessian(each, gauss_newton=True, keep_null=True).apply(identity) for each in (objective, bare))
-    )
+    assert torch.equal(*(SceneHessian(x, gauss_newton=True, keep_null=True).apply(identity) for x in (objective, bare)))
     traces = exact_traces(objective, torch.Generator().manual_seed(0), samples=64)
     for name, trace in block_traces(objective).items():
         projected = SceneHessian(objective).apply(identity).diagonal()[objective.blocks[name]].sum()

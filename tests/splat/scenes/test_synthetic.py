@@ -83,9 +83,7 @@ def test_points_behind_another_surface_are_not_seen(small: SyntheticScene) -> No
     assert len(points.observations) < int(within)
 
 
-@pytest.mark.parametrize(
-    "settings", [{"gaussians": 10}, {"views": 1}, {"width": 4}, {"arc": 200.0}, {"point_share": 0.0}]
-)
+@pytest.mark.parametrize("settings", [{"gaussians": 10}, {"views": 1}, {"width": 4}, {"arc": 200}, {"point_share": 0}])
 def test_settings_that_make_no_scene_are_refused(settings: dict) -> None:
     refused("expected", SyntheticSettings, **settings)
 

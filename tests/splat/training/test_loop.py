@@ -104,9 +104,7 @@ def test_pictures_and_losses_that_do_not_fit_are_made_anew_and_change_nothing(mo
 def test_the_position_rate_is_held_for_its_first_steps_and_decays_exponentially_to_its_final_value():
     for hold, held in ((0, [0]), (100, [1, 50, 100])):
         rates = LearningRates(position_hold=hold)
-        assert [position_rate(rates, 3.0, step, 700) for step in held] == [pytest.approx(3 * 1.6e-4, rel=1e-14)] * len(
-            held
-        )
+        assert [position_rate(rates, 3.0, at, 700) for at in held] == pytest.approx([3 * 1.6e-4] * len(held), rel=1e-14)
         middle = sqrt(rates.position * rates.position_final)
         assert position_rate(rates, 1.0, (hold + 700) // 2, 700) == pytest.approx(middle, rel=1e-14)
         assert position_rate(rates, 3.0, 700, 700) == pytest.approx(3.0 * rates.position_final, rel=1e-14)

@@ -111,9 +111,7 @@ def test_a_curve_that_is_stopped_goes_on(folder, curved, tmp_path, monkeypatch):
     assert not (tmp_path / ".out.unfinished").exists()
 
 
-@pytest.mark.parametrize("words", [
-    ("--keep", "0"), ("--score", "opacty"), ("--sample", "1"),
-])  # fmt: skip
+@pytest.mark.parametrize("words", [("--keep", "0"), ("--score", "opacty"), ("--sample", "1")])
 def test_what_cannot_be_is_refused_alone(folder, words, capsys):
     assert run(folder, *words) == 2
     sentence = capsys.readouterr().err

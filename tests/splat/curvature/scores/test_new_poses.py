@@ -115,9 +115,7 @@ def test_open_curvature_is_the_trace_of_the_dense_jacobians():
         """J^T J in blocks of the ten of the geometry, and the diagonal of the colours, by differences."""
         h = 1e-5 * torch.eye(gaussians.flat.numel(), dtype=DOUBLE)
         at = Poses([camera], every.background, SMOOTH)
-        ends = [
-            torch.stack([at.images(gaussians.with_flat(each))[0] for each in gaussians.flat + way]) for way in (h, -h)
-        ]
+        ends = [torch.stack([at.images(gaussians.with_flat(x))[0] for x in gaussians.flat + way]) for way in (h, -h)]
         J = ((ends[0] - ends[1]) / 2e-5).flatten(1).T
         parts = [J[:, rows].view(len(J), 4, -1) for rows in gaussians.blocks.values()]
         geometry = torch.einsum("kni,nij->knj", torch.cat(parts[:4], dim=2), complement(gaussians.quats))

@@ -226,9 +226,7 @@ def test_the_split_of_a_file_is_taken_whole_or_in_part(tmp_path: Path) -> None:
     scene = load_scene(tmp_path / "s")
     assert split_scene(scene) == Split((a, c), (b,), "named") and usual_views(scene) == 2 and scene.notes == ()
     assert split_scene(scene, 1).train == (a,)
-    rewrite(
-        tmp_path / "part", lambda content: content.update(train_filenames=[a], test_filenames=[b], val_filenames=[c])
-    )
+    rewrite(tmp_path / "part", lambda found: found.update(train_filenames=[a], test_filenames=[b], val_filenames=[c]))
     assert split_scene(load_scene(tmp_path / "part")).test == (b,)
     words = ["transforms.json says val_filenames, which is not used", "1 frames are in neither list", f"such as {c}"]
     assert all(part in " ".join(load_scene(tmp_path / "part").notes) for part in words)

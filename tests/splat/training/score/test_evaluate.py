@@ -81,9 +81,7 @@ def test_without_lpips_for_every_view_there_is_no_mean():
     assert first.lpips is None and [view.lpips for view in first.views] == [0.5, None, 0.25]
     assert second.lpips == 0.375
     assert first.avge is None and first.views[1].avge is None and first.views[0].avge is not None
-    of_each = [
-        (10 ** (-view.psnr / 10) * (1 - view.ssim) ** 0.5 * (view.lpips or 0.0)) ** (1 / 3) for view in second.views
-    ]
+    of_each = [(10 ** (-v.psnr / 10) * (1 - v.ssim) ** 0.5 * (v.lpips or 0.0)) ** (1 / 3) for v in second.views]
     assert [view.avge for view in second.views] == pytest.approx(of_each)
     assert second.avge == pytest.approx(sum(of_each) / 3)  # the mean over the views, not of their means
     assert evaluate(tiny_gaussians(), views).lpips is None
