@@ -8,7 +8,7 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.reference import project
-from tests.refusals import refused
+from tests.refusals import misused
 from tests.splat.tiny import tiny_gaussians, tiny_views
 
 FOCAL, DEPTH = 40.0, 4.0
@@ -77,6 +77,6 @@ def test_masses_are_spread_as_the_vector_is() -> None:
 
 def test_vectors_that_do_not_fit_or_have_no_length_are_refused() -> None:
     gaussians = facing((0.1, 0.1))
-    refused("expected a vector of 23 parameters", masses, torch.ones(3), gaussians)
+    misused("expected a vector of 23 parameters", masses, torch.ones(3), gaussians)
     for value in (0.0, float("nan")):
-        refused("finite vector that is not zero", masses, torch.full((23,), value), gaussians)
+        misused("finite vector that is not zero", masses, torch.full((23,), value), gaussians)

@@ -21,7 +21,7 @@ from splat.projection.reference import project
 from splat.render.render import render
 from splat.scenes.view import View
 from tests.oracles import central_difference
-from tests.refusals import refused
+from tests.refusals import misused, refused
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, mean_loss, two_views
 from tests.splat.photometric import photometric_loss
 from tests.splat.random_scenes import ANTIALIASED, MODES, filtered, random_camera, random_gaussians, random_like
@@ -222,7 +222,7 @@ def test_gaussians_vectors_and_images_of_another_dtype_are_refused():
     double = objective.active.to(torch.float64)
     view = objective.linearizer(objective.active)(0)
     vectors = torch.ones(len(double.flat), 1, dtype=torch.float64)
-    refused = [
+    calls = [
         lambda: objective.linearizer(double)(0),
         lambda: objective.loss(double.flat),
         lambda: objective.evaluate_view(0, double),
@@ -232,8 +232,8 @@ def test_gaussians_vectors_and_images_of_another_dtype_are_refused():
         lambda: view.vjp(view.image.new_ones(1, 4, *view.image.shape[1:], dtype=torch.float64)),
         lambda: SceneHessian(objective).apply(vectors),
     ]
-    for call in refused:
-        refused(r"expected .*torch\.float32.* got .*torch\.float64", call)
+    for call in calls:
+        misused(r"expected .*torch\.float32.* got .*torch\.float64", call)
 
 
 def test_what_no_pixel_sees_has_no_derivative():
