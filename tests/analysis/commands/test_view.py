@@ -9,8 +9,8 @@ import torch
 from analysis.commands.cli import main
 from analysis.commands.map.fields import measured_fields
 from analysis.commands.map.pictures import rendered
-from analysis.commands.view import page
 from analysis.commands.view import viewer as view
+from analysis.commands.view.command import offline_page
 from analysis.measures.steepest import heaviest_view
 from splat.curvature.objective import SceneObjective
 from splat.projection.reference import rotation_matrices
@@ -157,6 +157,6 @@ def _ray(viewer: view.Viewer, objective: SceneObjective) -> tuple[list[float], l
 
 def test_a_page_needs_no_network(viewer):
     viewer.add_fields(measured_fields(viewer.objective, Path("nowhere"), NOTHING, [], lambda *_: None), "condition")
-    written = page.offline_page(viewer, "condition")
+    written = offline_page(viewer, "condition")
     assert "__VISER_EMBED_DATA__" in written and len(written) < 2e6
     assert 'src="http' not in written and 'href="http' not in written
