@@ -130,7 +130,7 @@ def test_titles_of_renders_along_an_end_stay_apart(tmp_path):
     end = json.loads((tmp_path / "map" / "map.json").read_text())["steepest"][0]
     end["carriers"] = [end["carriers"][0] | {"gaussian": 123456 + i, "share": 0.152} for i in range(5)]
     end |= {"step": 0.00373, "length": "1/32 × the optimiser's step", "losses": [0.07408, 0.0735, 0.07414]}
-    pictures = {name: np.zeros((126, 168, 3), np.uint8) for name in maps.END_MAPS}
+    pictures: dict[str, np.ndarray] = {name: np.zeros((126, 168, 3), np.uint8) for name in maps.END_MAPS}
     pictures["difference"] = np.zeros((126, 168), np.uint8)
     figure = maps.draw_steepest(pictures, convert(end, Steepest))
     require_apart(said := words(figure, laid_out(figure)))
