@@ -78,6 +78,14 @@ def test_tile_lists_hold_every_active_row_and_hardly_any_other(name, dtype):
     assert rows_of_tiles.sum() > 0.75 * listed.sum()
 
 
+def test_vectors_of_two_rows_of_pixels_hold_fewer_pixels_outside_of_small_splats_than_rows_as_long():
+    raster, (width, height), L = truth("typical").raster(DTYPES[0]), truth("typical").case.size, lanes_of(np.float32)
+    padded = np.zeros((truth("typical").case.n, *raster.plane), bool)
+    padded[:, :height, :width] = active_pixels("typical")
+    in_rows = L * padded.reshape(len(padded), -1, L).any(axis=2).sum()
+    assert padded.sum() < raster.pairs < in_rows
+
+
 def test_tiles_are_handed_out_once_each():
     raster = truth("typical").raster(DTYPES[0])
     assert sorted(raster.lists.order) == list(range(raster.lists.start.size - 1))
