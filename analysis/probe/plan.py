@@ -11,7 +11,7 @@ TIMED = 3  # renders; the median counts
 MEASURES = 33.0  # products with MOST_AT_ONCE vectors that --measures takes as long as
 PRODUCT, BEFORE = 4.5, 50  # in renders: a product with MOST_AT_ONCE vectors; all that comes before the first stage
 PICTURES, QUICK_PICTURES = 3.0, 0.5  # seconds to draw them, which hardly depend on the scene
-POINTS = 110  # of a slice's plane: with the others' boxes usually as long as so many renders
+POINTS = 150  # of a slice's plane: with the others' boxes usually as long as so many renders
 
 
 def seconds_of_render(objective: SceneObjective) -> float:

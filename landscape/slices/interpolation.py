@@ -30,8 +30,7 @@ DIGITS = 9  # of distances: points that are as far but for round-off are taken i
 class PlaneInterpolant:
     """The interpolant on a grid x times y that has 0 in both.  Points are numbered as in the flattened grid.
 
-    axes: the points of both axes.  mixed: a.  through_axes: False for the spline of f itself, through the points that are
-    known wherever they lie, of which the centre alone is needed (`axes`).
+    axes: the points of both axes.  mixed: a.  through_axes: False for the spline of f itself, through all known points.
 
     >>> x = np.linspace(-1, 1, 9)
     >>> grid, f = PlaneInterpolant(x, x, mixed=0.5), (x[:, None] ** 2 + x * x[:, None] * (0.5 + x)).ravel()
@@ -46,8 +45,6 @@ class PlaneInterpolant:
         self._i, self._j = (int(np.flatnonzero(axis == 0)[0]) for axis in (x, y))
         number = np.arange(len(x) * len(y)).reshape(len(x), len(y))
         self.axes = np.unique(np.concatenate([number[:, self._j], number[self._i]]))
-        if not through_axes:
-            self.axes = number[self._i, [self._j]]
         places = np.meshgrid(*(axis / np.abs(axis).max() for axis in (x, y)), indexing="ij")
         self._places = np.stack(places, axis=-1).reshape(-1, 2)
 

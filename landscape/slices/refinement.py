@@ -10,8 +10,8 @@ bound: `interpolation.error_bound`, of the error at every point not known, from 
 hold-out may err with a chance of 5% / 2^k.  range: largest less smallest of the values evaluated.
 
 control: a cheap function that differs from the loss by little that is smooth.  It is refined first, in the same way, to half
-the tolerance.  Of the loss itself only COARSE / 2 points and the centre are evaluated at first, and a third of a hold-out: the
-spline through its differences from the control predicts the others.  Both bounds are added.
+the tolerance.  Of the loss itself the axes and COARSE / 2 points are evaluated at first, and a third of a hold-out: the spline
+through its differences from the control predicts the others.  Both bounds are added.
 
 A slice keeps the interpolant that was judged.  Fitting it again with the points held out made it worse in 95% of the draws on
 a fern's planes: some lie next to an axis, where its spline, divided by x y, magnifies jumps.  A plane whose bound is not

@@ -1,7 +1,7 @@
 """Slices of an objective L: its values on a grid along one or two directions e_d, and its quadratic model.
 
-    f(x)     = L(center + sum_d x_d e_d)              evaluated where needed (`refinement`), interpolated elsewhere, on the
-                                                      axes only where there is a control
+    f(x)     = L(center + sum_d x_d e_d)              evaluated where needed (`refinement`), interpolated elsewhere,
+                                                      never on the axes
     model(x) = L + b . x + x^T A x / 2                b = E^T g,  A = E^T H E
 
 x is in multiples of the directions: for unit vectors in units of the parameters.  `curvature_reach` gives ranges in units of
