@@ -19,8 +19,6 @@ a: an array of floats, C-contiguous; `at` counts its numbers.
 # pyright: reportOptionalCall=false
 # (numba declares its decorators as None until they are set up)
 
-import operator
-
 import numpy as np
 from llvmlite import ir
 from numba.core import types
@@ -35,6 +33,7 @@ from splat.backend.cpu.simd import (
     intrinsic,
     lanes,
     load_at,
+    numbered,
     select,
     splat_of,
     store,
@@ -191,21 +190,14 @@ def store_pixels(typing, plane, at, stride, value):
     return types.void(plane, at, stride, vector), generate
 
 
-def _constant(like, number_of):
-    """A vector of a number of each lane, and the number of lanes in a row of pixels."""
-    vector = VectorType(like.dtype)
-    numbers = [float(number_of(lane, vector.lanes // PIXEL_ROWS)) for lane in range(vector.lanes)]
-    return vector(like), lambda *_: ir.Constant(vector.llvm, numbers)
-
-
 @intrinsic
 def pixel_columns(typing, like):
-    return _constant(like, operator.mod)
+    return numbered(like, lambda lane, lanes: lane % (lanes // PIXEL_ROWS))
 
 
 @intrinsic
 def pixel_rows(typing, like):
-    return _constant(like, operator.floordiv)
+    return numbered(like, lambda lane, lanes: lane // (lanes // PIXEL_ROWS))
 
 
 @formula

@@ -344,14 +344,16 @@ def broadcast(typing, array, number):
     return vector(array, vector), lambda context, builder, sig, args: args[1]
 
 
+def numbered(array, number_of):
+    """For an intrinsic: a constant vector of the array's dtype, number_of(lane, lanes) in each lane."""
+    vector = VectorType(array.dtype)
+    numbers = [float(number_of(lane, vector.lanes)) for lane in range(vector.lanes)]
+    return vector(array), lambda *_: ir.Constant(vector.llvm, numbers)
+
+
 @intrinsic
 def iota(typing, array):
-    vector = VectorType(array.dtype)
-
-    def generate(context, builder, sig, args):
-        return ir.Constant(vector.llvm, [float(i) for i in range(vector.lanes)])
-
-    return vector(array), generate
+    return numbered(array, lambda lane, _: lane)
 
 
 @intrinsic

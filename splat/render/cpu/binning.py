@@ -13,7 +13,7 @@ from splat.backend.cpu.jit import kernel
 from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, gather, scatter, scratch, store_all
 from splat.backend.cpu.simd import broadcast, iota, lanes, lanes_of, load_all, prefetch, select
 from splat.backend.cpu.threads import over_range
-from splat.render.cpu.tile import Lists
+from splat.render.cpu.tile import Lists, grid_of
 from splat.render.formulas import SPLAT, Thresholds, box_of, ellipse_of, rows_of_strip
 
 RADIX_BITS = 11
@@ -122,9 +122,7 @@ def bin_splats(
     splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, thresholds: Thresholds
 ) -> Lists:
     """The tile lists of a view; the tiles are ordered heaviest first.  Accumulators come with `reached_lists`."""
-    tile = lanes_of(depths.dtype) // PIXEL_ROWS
-    columns = -(-width // (tile * PIXEL_ROWS)) * PIXEL_ROWS
-    tile_count = columns * -(-height // TILE_HEIGHT)
+    tile, columns, tile_rows = grid_of(width, height, lanes_of(depths.dtype))
     order = depth_order(depths, drawn)
     boxes, limits = np.empty((len(splats), BOX)), (thresholds.alpha_min, thresholds.contour)
     over_range(len(splats), find_boxes, splats, tile, width, height, *limits, boxes)
@@ -133,7 +131,7 @@ def bin_splats(
     count = np.empty(order.size, np.int32)
     tiles, rows = np.empty(place[-1], np.int32), np.empty(place[-1], np.int32)
     over_range(order.size, list_tiles, splats, order, boxes, tile, columns, width, height, place, count, tiles, rows)
-    intersections, start = int(count.sum()), np.empty(tile_count + 1, np.int64)
+    intersections, start = int(count.sum()), np.empty(columns * tile_rows + 1, np.int64)
     splat_of, rows_of = np.empty(intersections, np.int32), np.empty(intersections, np.int32)
     fill_lists(order, place, count, tiles, rows, start, splat_of, rows_of)
     return Lists(start, splat_of, rows_of, np.empty(0, np.int32), heaviest_first(np.diff(start)))

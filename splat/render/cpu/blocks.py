@@ -20,7 +20,7 @@ Where the cap holds, q is constant: only c c is left.
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import PIXEL_ROWS, TILE_ROWS, scratch
+from splat.backend.cpu.memory import TILE_ROWS, scratch
 from splat.backend.cpu.simd import broadcast, lanes, load, prefetch, store, store_sums
 from splat.render.cpu.tile import (
     BEHIND,
@@ -35,6 +35,7 @@ from splat.render.cpu.tile import (
     load3,
     load_planes,
     next_tile,
+    row_at,
     row_v,
     store3,
     undo_row,
@@ -55,13 +56,13 @@ def block_moments(counter, params, lists, frame, pixels, v_planes, curvature, su
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            b, p = BLOCK * L * y, corner + PIXEL_ROWS * y * frame.stride
+            b, p = BLOCK * L * y, row_at(corner, y, frame)
             begin_undo_row(state, b, L, frame, pixels, p)
             store3(state, b + GRAD * L, L, load_planes(v_planes, p, frame))
             store3(state, b + CURVATURE * L, L, load_planes(curvature, p, frame))
         first, count = intersections_of(lists, tile)
-        plain = dark(v_planes, 0, 4, corner, frame.size, frame.stride)
-        if plain and dark(curvature, 0, 3, corner, frame.size, frame.stride):
+        plain = dark(v_planes, 0, 4, corner, frame)
+        if plain and dark(curvature, 0, 3, corner, frame):
             clear_sums(lists, first, count, BLOCK_SUMS, sums)
             count = 0
         for k in range(count - 1, -1, -1):

@@ -50,9 +50,11 @@ from splat.render.cpu.tile import (
     load_cotangent,
     next_tile,
     no_moments,
+    row_at,
     row_v,
     store3,
     store_moments,
+    store_planes,
 )
 from splat.render.formulas import SPLAT, alpha_row, behind_all, plus, step_back
 
@@ -76,19 +78,19 @@ def forward(counter, params, lists, frame, pixels):
             store(state, b + STOP * L, select(here, broadcast(params, NEVER), 0.0))
             store3(state, b + IMAGE * L, L, (0.0, 0.0, 0.0))
         first, count = intersections_of(lists, tile)
-        some_stopped = True
+        some_stopped = False
         # front to back; every 16 splats, if a pixel has stopped since the last look: have all?
         for k in range(count):
             prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
             some_stopped |= composite(params, lists, first + k, k, x0, y0, frame, state)
             if some_stopped and (k & 15) == 15:
-                some_stopped = True
+                some_stopped = False
                 if all_stopped(state, L):
                     break
         furthest = broadcast(params, 0.0)
         for y in range(TILE_ROWS):
             furthest = maximum(furthest, load(state, (FORWARD * y + STOP) * L))
-            end_row(state, FORWARD * L * y, L, frame, pixels, corner + PIXEL_ROWS * y * frame.stride)
+            end_row(state, FORWARD * L * y, L, frame, pixels, row_at(corner, y, frame))
         store(state, 0, furthest)
         pixels.reached[tile] = np.int64(min(count, state[:L].max()))
         tile = next_tile(counter, lists)
@@ -124,13 +126,10 @@ def end_row(state, b, L, frame, pixels, p):
     """Add the background to a row, and write its colour, alpha, final T and stops at p of each plane."""
     # the final T, of stopped pixels too
     last = maximum(load(state, b + T * L), -load(state, b + T * L))
-    stride = frame.stride
-    store_pixels(pixels.transmittance, p, stride, last)
-    store_pixels(pixels.stop, p, stride, load(state, b + STOP * L))
+    store_pixels(pixels.transmittance, p, frame.stride, last)
+    store_pixels(pixels.stop, p, frame.stride, load(state, b + STOP * L))
     image = plus(load3(state, b + IMAGE * L, L), last, frame.background)
-    for c in range(3):
-        store_pixels(pixels.planes, c * frame.size + p, stride, image[c])
-    store_pixels(pixels.planes, 3 * frame.size + p, stride, 1.0 - last)
+    store_planes(pixels.planes, p, frame, image, 1.0 - last)
 
 
 @formula
@@ -158,11 +157,11 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
             # behind all splats: the final T, and R of the background
-            p = corner + PIXEL_ROWS * y * frame.stride
+            p = row_at(corner, y, frame)
             begin_backward_row(state, BACKWARD * L * y, L, frame, pixels, v_planes, p)
         first, count = intersections_of(lists, tile)
         # a tile without cotangent adds nothing
-        if dark(v_planes, 0, 4, corner, frame.size, frame.stride):
+        if dark(v_planes, 0, 4, corner, frame):
             clear_sums(lists, first, count, SPLAT, sums)
             count = 0
         # back to front

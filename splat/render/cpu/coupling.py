@@ -50,10 +50,7 @@ FIRST, SECOND = (tuple((k + 1) ** power * tap for k, tap in enumerate(TAPS)) for
 
 @kernel
 def coupled_blocks(counter, index, params, frame, footprints, image, target, seconds, blocks):
-    """Add sum M . S'' M' to the blocks (m, 9, 9) of the splats at index, largest first: threads then end at the same time.
-
-    size: height and width of the image.
-    """
+    """Add sum M . S'' M' to the blocks (m, 9, 9) of the splats at index, largest first: threads then end at the same time."""
     L = lanes(params)
     widest = FIELDS * (frame.stride + 2 * EDGE)
     ring, rows = scratch(params, RING * widest), scratch(params, TOGETHER * widest)

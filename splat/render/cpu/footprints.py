@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import PIXEL_ROWS, TILE_ROWS, load_pixels, scratch
+from splat.backend.cpu.memory import TILE_ROWS, load_pixels, scratch
 from splat.backend.cpu.simd import broadcast, lanes, load, maximum, select, store
 from splat.render.cpu.tile import (
     BEHIND,
@@ -24,6 +24,7 @@ from splat.render.cpu.tile import (
     intersections_of,
     load3,
     next_tile,
+    row_at,
     row_range,
     row_v,
     store3,
@@ -76,7 +77,7 @@ def find_footprints(counter, params, lists, frame, pixels, footprints, begin, en
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            begin_undo_row(state, UNDO * L * y, L, frame, pixels, corner + PIXEL_ROWS * y * frame.stride)
+            begin_undo_row(state, UNDO * L * y, L, frame, pixels, row_at(corner, y, frame))
         first, count = intersections_of(lists, tile)
         for k in range(count - 1, -1, -1):
             a = lists.accumulator[first + k]
@@ -113,7 +114,7 @@ def find_neighbours(counter, params, lists, frame, pixels, covered, before):
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            p = corner + PIXEL_ROWS * y * frame.stride
+            p = row_at(corner, y, frame)
             store(state, 2 * L * y, load_pixels(pixels.stop, p, frame.stride))
             store(state, (2 * y + 1) * L, -1.0)
         first, count = intersections_of(lists, tile)

@@ -40,8 +40,8 @@ class CpuRaster:
         self.lists = self.bin(depths, drawn)
         self.intersections = self.lists.splat.size
         lanes, scalar, limits = lanes_of(self.dtype), self.dtype.type, self.thresholds
-        columns, tile_rows = -(-width // lanes) * PIXEL_ROWS, -(-height // TILE_HEIGHT)
-        self.plane = (tile_rows * TILE_HEIGHT, columns * lanes // PIXEL_ROWS)
+        across, columns, tile_rows = tile.grid_of(width, height, lanes)
+        self.plane = (tile_rows * TILE_HEIGHT, columns * across)
         size = self.plane[0] * self.plane[1]
         self.frame = tile.Frame(
             width, height, columns, self.plane[1], size, scalar(limits.alpha_max), scalar(limits.free), scalar(limits.floor),

@@ -9,7 +9,7 @@ those of a tangent K times.
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import PIXEL_ROWS, TILE_ROWS, load_pixels, scratch, store_pixels
+from splat.backend.cpu.memory import TILE_ROWS, load_pixels, scratch, store_pixels
 from splat.backend.cpu.simd import fma, lanes, load, prefetch, select, store
 from splat.render.cpu.compositing import begin_backward_row
 from splat.render.cpu.tile import (
@@ -37,9 +37,11 @@ from splat.render.cpu.tile import (
     load_cotangent,
     next_tile,
     no_moments,
+    row_at,
     row_v,
     store3,
     store_moments,
+    store_planes,
     tangent_terms,
 )
 from splat.render.formulas import (
@@ -67,7 +69,7 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
             store(state, width * y + T * L, 1.0)
-            p = corner + PIXEL_ROWS * y * frame.stride
+            p = row_at(corner, y, frame)
             store(state, width * y + STOP * L, load_pixels(pixels.stop, p, frame.stride))
             for j in range(2, 2 + TANGENT * K):
                 store(state, width * y + j * L, 0.0)
@@ -82,7 +84,7 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
             else:
                 tangent_block(params, tangents, K, lists, first + k, k, x0, y0, frame, state, shared)
         for y in range(TILE_ROWS):
-            p = corner + PIXEL_ROWS * y * frame.stride
+            p = row_at(corner, y, frame)
             for i in range(K):
                 end_tangent_row(state, width * y + (2 + TANGENT * i) * L, L, frame, planes, transmittances, i, p)
         tile = next_tile(counter, lists)
@@ -91,12 +93,10 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
 @formula
 def end_tangent_row(state, b, L, frame, planes, transmittances, i, p):
     """Add the background's part to a row of tangent i, and write it to the planes."""
-    dT, stride = load(state, b + DT * L), frame.stride
-    store_pixels(transmittances, i * frame.size + p, stride, dT)
+    dT = load(state, b + DT * L)
+    store_pixels(transmittances, i * frame.size + p, frame.stride, dT)
     dimage = plus(load3(state, b + DIMAGE * L, L), dT, frame.background)
-    for c in range(3):
-        store_pixels(planes, (4 * i + c) * frame.size + p, stride, dimage[c])
-    store_pixels(planes, (4 * i + 3) * frame.size + p, stride, -dT)
+    store_planes(planes, 4 * i * frame.size + p, frame, dimage, -dT)
 
 
 @formula
@@ -165,14 +165,14 @@ def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, 
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            p = corner + PIXEL_ROWS * y * frame.stride
+            p = row_at(corner, y, frame)
             begin_backward_row(state, width * y, L, frame, pixels, v_planes, p)
             for i in range(K):
                 b = width * y + (BACKWARD + BACKWARD_TANGENT * i) * L
                 begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_planes, i, p)
         first, count = intersections_of(lists, tile)
-        plain = dark(v_planes, 0, 4, corner, frame.size, frame.stride)
-        if plain and dark(dv_planes, 0, 4 * K, corner, frame.size, frame.stride):
+        plain = dark(v_planes, 0, 4, corner, frame)
+        if plain and dark(dv_planes, 0, 4 * K, corner, frame):
             clear_sums(lists, first, count, K * SPLAT, sums)
             count = 0
         for k in range(count - 1, -1, -1):

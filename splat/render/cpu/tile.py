@@ -13,7 +13,15 @@ from typing import NamedTuple
 import numpy as np
 
 from splat.backend.cpu.jit import formula
-from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, load_pixels, pixel_columns, pixel_rows
+from splat.backend.cpu.memory import (
+    PIXEL_ROWS,
+    TILE_HEIGHT,
+    TILE_ROWS,
+    load_pixels,
+    pixel_columns,
+    pixel_rows,
+    store_pixels,
+)
 from splat.backend.cpu.simd import any_lane, broadcast, fetch_and_increment, fma, load, select, store, store_sums
 from splat.render.formulas import SPLAT, along_row, alpha_row, column_terms, reciprocal, row_terms
 
@@ -45,6 +53,11 @@ class Lists(NamedTuple):
     rows: np.ndarray
     accumulator: np.ndarray
     order: np.ndarray
+
+
+def grid_of(width: int, height: int, lanes: int) -> tuple[int, int, int]:
+    """Pixels in a tile's row, tiles in a row, rows of tiles of an image: a row of its planes is a number of whole registers."""
+    return lanes // PIXEL_ROWS, -(-width // lanes) * PIXEL_ROWS, -(-height // TILE_HEIGHT)
 
 
 class Frame(NamedTuple):
@@ -90,6 +103,12 @@ def corner_of(tile, lanes, columns, stride):
     """Column and row of a tile's first pixel, and its index in a plane."""
     x0, y0 = (tile % columns) * (lanes // PIXEL_ROWS), (tile // columns) * TILE_HEIGHT
     return x0, y0, y0 * stride + x0
+
+
+@formula
+def row_at(corner, y, frame):
+    """Index in a plane of the first pixel of a tile's row y; corner: that of its first row."""
+    return corner + PIXEL_ROWS * y * frame.stride
 
 
 @formula
@@ -205,6 +224,14 @@ def load_planes(planes, p, frame):
 
 
 @formula
+def store_planes(planes, p, frame, image, alpha):
+    """Write the row of pixels at p of four planes."""
+    for c in range(3):
+        store_pixels(planes, c * frame.size + p, frame.stride, image[c])
+    store_pixels(planes, 3 * frame.size + p, frame.stride, alpha)
+
+
+@formula
 def load_cotangent(planes, p, frame):
     """v_image and v_alpha of a row."""
     red, green, blue = load_planes(planes, p, frame)
@@ -219,12 +246,12 @@ def intersections_of(lists, tile):
 
 
 @formula
-def dark(planes, first_plane, count, corner, size, stride):
+def dark(planes, first_plane, count, corner, frame):
     """Whether `count` planes are exactly 0 all over a tile: a cotangent that leaves nothing to do."""
     lit, one = broadcast(planes, 0.0), broadcast(planes, 1.0)
     for plane in range(first_plane, first_plane + count):
-        for y in range(0, TILE_HEIGHT, PIXEL_ROWS):
-            value = load_pixels(planes, plane * size + corner + y * stride, stride)
+        for y in range(TILE_ROWS):
+            value = load_pixels(planes, plane * frame.size + row_at(corner, y, frame), frame.stride)
             lit = select((value >= 0.0) & (value <= 0.0), lit, one)  # NaN is neither
     return not any_lane(lit > 0.0)
 
