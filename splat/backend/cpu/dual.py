@@ -23,7 +23,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import lower_builtin, models, register_model
 
 from splat.backend.cpu.exponential import emit_exp
-from splat.backend.cpu.simd import VectorType, call_on_lanes, intrinsic, select
+from splat.backend.cpu.simd import FIRST, VectorType, call_on_lanes, intrinsic, select
 
 __all__ = ["dual", "exp", "select", "sqrt", "tangent_of", "value_of", "variable"]
 
@@ -112,7 +112,7 @@ def _register(function, emit) -> None:
     """Type and lower function for two duals, a dual and a number, a number and a dual."""
 
     class Template(AbstractTemplate):
-        key = function
+        key, metadata = function, FIRST
 
         def generic(self, args, kws):
             duals = {argument for argument in args if isinstance(argument, DualType)}

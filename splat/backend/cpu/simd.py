@@ -59,6 +59,8 @@ def _register_bits() -> int:
 
 REGISTER_BITS = _register_bits()
 keep_kernels(REGISTER_BITS)
+# of a template: tried before Numba's own for the same function, which are of any target and take a third of compilation
+FIRST = {"target": "cpu"}
 I32, I64, F32 = ir.IntType(32), ir.IntType(64), ir.FloatType()
 
 
@@ -141,7 +143,7 @@ def _common(arguments) -> VectorType | None:
 
 def _register(function, emit, to_mask: bool = False) -> None:
     class Template(AbstractTemplate):
-        key = function
+        key, metadata = function, FIRST
 
         def generic(self, args, kws):
             vector = _common(args)
@@ -206,7 +208,7 @@ def _register_of(kind, function, emit) -> None:
     """Type and lower a function of vectors, or of masks, alone."""
 
     class Template(AbstractTemplate):
-        key = function
+        key, metadata = function, FIRST
 
         def generic(self, args, kws):
             return signature(args[0], *args) if isinstance(args[0], kind) and len(set(args)) == 1 else None
