@@ -8,7 +8,7 @@ from tests.hostile import fuzz
 from tests.hostile.fuzz import fuzzed
 from tests.hostile.readers import READERS
 
-CASES = 150  # of each; `python -m tests.hostile.fuzz --cases 10000` goes further
+CASES = 100  # of each; `python -m tests.hostile.fuzz --cases 10000` goes further
 
 
 def test_without_the_developers_tools_one_sentence_says_what_to_install(monkeypatch, capsys):
