@@ -14,7 +14,8 @@ Gaussians of Mip-Splatting have a constant beside their parameters: the width of
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import isqrt
+from functools import lru_cache
+from math import isqrt, prod
 
 import torch
 from jaxtyping import Float
@@ -35,6 +36,16 @@ def attribute_shapes(n: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
         "opacity_logits": (n,),
         "sh": (n, (sh_degree + 1) ** 2, 3),
     }
+
+
+@lru_cache
+def layout(n: int, sh_degree: int) -> dict[str, tuple[slice, tuple[int, ...]]]:
+    """The rows in the flat vector, and the shape, of every attribute; nobody changes it."""
+    result, start = {}, 0
+    for name, shape in attribute_shapes(n, sh_degree).items():
+        result[name] = slice(start, start + prod(shape)), shape
+        start += prod(shape)
+    return result
 
 
 def parameters_per_gaussian(sh_degree: int) -> int:
@@ -88,38 +99,36 @@ class Gaussians(ShortRepr):
     @property
     def blocks(self) -> dict[str, slice]:
         """The rows of each attribute in the flat vector."""
-        result, start = {}, 0
-        for name, shape in attribute_shapes(len(self), self.sh_degree).items():
-            size = int(torch.Size(shape).numel())
-            result[name] = slice(start, start + size)
-            start += size
-        return result
+        return {name: rows for name, (rows, _) in layout(len(self), self.sh_degree).items()}
 
     @property
     def attributes(self) -> dict[str, Tensor]:
         """The five attributes as views of the flat vector."""
-        shapes = attribute_shapes(len(self), self.sh_degree)
-        return {name: self.flat[block].view(shapes[name]) for name, block in self.blocks.items()}
+        return {name: self._view(name) for name in ATTRIBUTES}
+
+    def _view(self, name: str) -> Tensor:
+        rows, shape = layout(len(self), self.sh_degree)[name]
+        return self.flat[rows].view(shape)
 
     @property
     def means(self) -> Float[Tensor, "n 3"]:
-        return self.attributes["means"]
+        return self._view("means")
 
     @property
     def log_scales(self) -> Float[Tensor, "n 3"]:
-        return self.attributes["log_scales"]
+        return self._view("log_scales")
 
     @property
     def quats(self) -> Float[Tensor, "n 4"]:
-        return self.attributes["quats"]
+        return self._view("quats")
 
     @property
     def opacity_logits(self) -> Float[Tensor, " n"]:
-        return self.attributes["opacity_logits"]
+        return self._view("opacity_logits")
 
     @property
     def sh(self) -> Float[Tensor, "n k 3"]:
-        return self.attributes["sh"]
+        return self._view("sh")
 
     def with_flat(self, flat: Tensor) -> "Gaussians":
         """The same layout and filter over another vector of parameters."""
@@ -196,12 +205,14 @@ class Gaussians(ShortRepr):
 
     def _is_moderate(self, largest: float) -> bool:
         """Whether no number is beyond `largest`, no quaternion below its inverse and no filter below 0."""
-        low, high = torch.aminmax(self.flat.detach())
-        least = self.quats.detach().abs().amax(dim=1).amin()
-        parts = [low >= -largest, high <= largest, least >= 1 / largest]  # False of nan
+        ends = [*torch.aminmax(self.flat.detach()), self.quats.detach().abs().amax(dim=1).amin()]
         if self.filter_widths is not None:
-            parts += [self.filter_widths.amin() >= 0, self.filter_widths.amax() <= largest]
-        return bool(torch.stack(parts).all())  # waits for a GPU once
+            ends += torch.aminmax(self.filter_widths)
+        low, high, least, *widths = torch.stack(ends).cpu().tolist()  # waits for a GPU once
+        narrow, wide = widths or (0.0, 0.0)
+        return (
+            -largest <= low and high <= largest and least >= 1 / largest and narrow >= 0 and wide <= largest
+        )  # not of nan
 
     def _refuse(self, good: Tensor, name: str, quality: str, meaning: str) -> None:
         first = int((~good).nonzero()[0])

@@ -13,7 +13,7 @@ from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.memory import gather, gather_one, scatter, scatter_one, scratch, store_all, store_where
 from splat.backend.cpu.simd import any_lane, broadcast, lanes, load, load_all, store
 from splat.backend.cpu.threads import over_range
-from splat.model.gaussians import Gaussians
+from splat.model.gaussians import Gaussians, layout
 from splat.projection.antialias import antialiased_adjoint, antialiased_geometry, log_sizes, widths_of
 from splat.projection.formulas import (
     Lens,
@@ -34,7 +34,8 @@ from splat.projection.whitening import converted
 
 def attribute_arrays(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     """The five attributes as NumPy views."""
-    return tuple(value.detach().numpy() for value in gaussians.attributes.values())
+    flat = gaussians.flat.detach().numpy()
+    return tuple(flat[rows].reshape(shape) for rows, shape in layout(len(gaussians), gaussians.sh_degree).values())
 
 
 def width_array(gaussians: Gaussians, lens: Lens) -> np.ndarray | None:

@@ -60,7 +60,8 @@ def adam_step(
     size, L = len(m), lanes_of(arrays[0].dtype)
     over_range(size // L, update, *arrays, numbers)
     if rest := size % L:  # the last numbers, in vectors of their own
-        ends = [np.pad(array[-rest:], (0, L - rest)) for array in arrays]
+        ends = np.zeros((len(arrays), L), arrays[0].dtype)
+        ends[:, :rest] = [array[-rest:] for array in arrays]
         over_range(1, update, *ends, numbers)
         for array, end in zip(arrays, ends, strict=True):
             array[-rest:] = end[:rest]

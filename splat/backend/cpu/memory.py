@@ -19,6 +19,8 @@ a: an array of floats, C-contiguous; `at` counts its numbers.
 # pyright: reportOptionalCall=false
 # (numba declares its decorators as None until they are set up)
 
+from math import prod
+
 import numpy as np
 from llvmlite import ir
 from numba.core import types
@@ -54,10 +56,10 @@ def scratch(like, size):
 
 def aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     """An uninitialised array that starts on a cache line."""
-    size, item = int(np.prod(shape)), np.dtype(dtype).itemsize
-    buffer = np.empty(size * item + 64, np.uint8)
-    start = -buffer.ctypes.data % 64
-    return buffer[start : start + size * item].view(dtype).reshape(shape)
+    size = prod(shape) * np.dtype(dtype).itemsize
+    buffer = np.empty(size + 64, np.uint8)
+    start = -buffer.__array_interface__["data"][0] % 64
+    return np.ndarray(shape, dtype, buffer, start)
 
 
 def _transposed(builder, rows):

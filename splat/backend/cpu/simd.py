@@ -12,7 +12,8 @@ any width and type: the array that a vector is loaded from decides its dtype, an
     minimum(x, y), maximum(x, y), min(x, y), max(x, y), abs(x), sqrt(x), floor(x), ceil(x)
     x < y ..., m & n, m | n         masks;  select(m, x, y), of numbers and duals too;  any_lane(m)
     load_all(a, i, k), store_all(a, i, t)   a tuple of k vectors, one behind the other; k is a constant
-    store_sums(a, i, (v0, ...))     the sum over the lanes of each vector to a[i], a[i+1], ...
+    load_wide(a, i)                 numbers of any type in a vector of float64, of as many lanes as that has
+    store_sums(a, i, (v0, ...))     the sum over the lanes of each vector to a[i], a[i+1], ...;  lane_sum(v) of one
     prefetch(a, i)                  hint that a[i] will be read soon; no effect on results
 
 Requires C-contiguous arrays; indices are not checked.
@@ -256,6 +257,19 @@ def load(typing, array, index):
 
 
 @intrinsic
+def load_wide(typing, array, index):
+    """As many numbers as a vector of float64 has lanes, in double precision."""
+    wide = VectorType(types.float64)
+    vector = VectorType(array.dtype, wide.lanes)
+
+    def generate(context, builder, sig, args):
+        value = load_at(builder, address_of(context, builder, sig, args), vector)
+        return value if vector.bits == wide.bits else builder.fpext(value, wide.llvm)
+
+    return wide(array, index), generate
+
+
+@intrinsic
 def store(typing, array, index, value):
     vector = value if isinstance(value, VectorType) else VectorType(array.dtype)
 
@@ -331,6 +345,17 @@ def _sums_of_four(builder, vector, values):
 
 
 # --- functions of vectors ---------------------------------------------------------------------------------------------
+
+
+@intrinsic
+def lane_sum(typing, x):
+    """The sum over the lanes, in a fixed tree."""
+
+    def generate(context, builder, sig, args):
+        (vector,) = sig.args
+        return builder.extract_element(_sums_of_four(builder, vector, [args[0], *[vector.constant(0)] * 3]), I32(0))
+
+    return x.dtype(x), generate
 
 
 @intrinsic

@@ -28,7 +28,7 @@ from splat.losses.cpu.sweeps import (
 from splat.losses.cpu.window import RING, Frame, moments_rows
 from splat.losses.formulas import KINDS, SECONDS
 from splat.losses.protocols import require_planes
-from splat.losses.reference import LossSettings, beyond, window
+from splat.losses.reference import REACH, LossSettings, beyond, window
 
 RINGS = 5 << 18  # bytes of rings in a sweep: with more, another vector costs more cache than it shares
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
@@ -55,7 +55,8 @@ class CpuImageLoss:
         stride = -(-width // lanes_of(dtype)) * lanes_of(dtype)
         plane_rows = -(-height // TILE_HEIGHT) * TILE_HEIGHT
         self.dtype = np.dtype(dtype)
-        self.frame = Frame(height, width, plane_rows, stride, window(torch.float64).numpy().astype(dtype))
+        taps = tuple(window(torch.float64)[REACH:].numpy().astype(dtype))
+        self.frame = Frame(height, width, plane_rows, stride, taps)
         scalar, self.structural = self.dtype.type, settings.structural(height, width)
         self.pixel = settings.pixel_weight / (3 * height * width)
         eps, pixel, structural = map(scalar, (settings.eps, self.pixel, self.structural))
@@ -127,7 +128,8 @@ class CpuViewLoss(CpuImageLoss):
         gradient[:, self.frame.height :] = 0
         gradient[3] = 0
         value = self._sweep(*self._against(image), gradient.reshape(-1), *flat)
-        self._leave_margin(seconds)
+        if wanted:
+            self._leave_margin(seconds)
         return CpuLinearLoss(self, value, torch.from_numpy(gradient), image, *flat)
 
     def _leave_margin(self, planes: np.ndarray) -> None:
@@ -228,5 +230,5 @@ class CpuLinearLoss:
         """The pixel-diagonal of l'': that of SSIM is one blur with the squared window."""
         frame, diagonal = self.loss.frame, self.loss.planes(1)[0]
         diagonal[:, frame.height :] = 0
-        self._sweep(diagonal_rows, frame._replace(taps=frame.taps**2), diagonal.reshape(-1))
+        self._sweep(diagonal_rows, frame._replace(taps=tuple(tap**2 for tap in frame.taps)), diagonal.reshape(-1))
         return torch.from_numpy(diagonal)

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import scratch
-from splat.backend.cpu.simd import lanes, load, store
+from splat.backend.cpu.memory import neighbours, scratch
+from splat.backend.cpu.simd import broadcast, lane_sum, lanes, load, load_wide, store
 from splat.losses.reference import REACH
 
 BORDER = 16  # numbers, at least REACH; whole cache lines
@@ -29,13 +29,13 @@ RING = 16  # rows, at least WINDOW; a power of two
 
 
 class Frame(NamedTuple):
-    """The sizes of plane sets, and the weights of a window."""
+    """The sizes of plane sets, and the weights of a window: the middle one, then those at 1 to REACH on either side."""
 
     height: int
     width: int
     plane_rows: int
     stride: int
-    taps: np.ndarray
+    taps: tuple[np.floating, ...]
 
 
 @formula
@@ -117,20 +117,32 @@ def blur_along(rows, fields, frame, ring, first, y):
     for field in range(fields):
         begin, at = begin_of(rows, field, frame), ring_row(first + field, y, frame)
         for i in range(0, frame.stride, lanes(rows)):
-            total = load(rows, begin + i) * frame.taps[REACH]
-            for k in range(1, REACH + 1):
-                total += (load(rows, begin + i - k) + load(rows, begin + i + k)) * frame.taps[REACH + k]
-            store(ring, at + i, total)
+            p1, p2, p3, p4, p5, m1, m2, m3, m4, m5 = neighbours(rows, begin + i)
+            pairs = m1 + p1, m2 + p2, m3 + p3, m4 + p4, m5 + p5
+            store(ring, at + i, weighted(load(rows, begin + i), pairs, frame.taps))
+
+
+@formula
+def weighted(middle, pairs, taps):
+    """A window's sum, of its middle number and the sums of two at equal distances from it."""
+    total = middle * taps[0] + pairs[0] * taps[1]
+    return total + pairs[1] * taps[2] + pairs[2] * taps[3] + pairs[3] * taps[4] + pairs[4] * taps[5]
+
+
+@formula
+def two_rows(ring, field, y, k, i, frame):
+    """The sum of the rows k above and k below y of a field of a ring, at the lanes at i."""
+    return load(ring, ring_row(field, y - k, frame) + i) + load(ring, ring_row(field, y + k, frame) + i)
 
 
 @formula
 def blur_down(ring, field, y, i, frame):
     """The window over the rows around y of a field, at the lanes at i."""
-    total = load(ring, ring_row(field, y, frame) + i) * frame.taps[REACH]
-    for k in range(1, REACH + 1):
-        above, below = ring_row(field, y - k, frame) + i, ring_row(field, y + k, frame) + i
-        total += (load(ring, above) + load(ring, below)) * frame.taps[REACH + k]
-    return total
+    pairs = (
+        two_rows(ring, field, y, 1, i, frame), two_rows(ring, field, y, 2, i, frame), two_rows(ring, field, y, 3, i, frame),
+        two_rows(ring, field, y, 4, i, frame), two_rows(ring, field, y, 5, i, frame),
+    )  # fmt: skip
+    return weighted(load(ring, ring_row(field, y, frame) + i), pairs, frame.taps)
 
 
 @formula
@@ -142,14 +154,16 @@ def blur_down_three(ring, field, y, i, frame):
 
 @formula
 def row_sum(values, width):
-    """The sum of a bordered row in float64; four chains of additions, because one would wait for itself."""
-    a = b = c = d = 0.0
-    whole = width & ~3
-    for i in range(BORDER, BORDER + whole, 4):
-        a, b, c, d = a + values[i], b + values[i + 1], c + values[i + 2], d + values[i + 3]
+    """The sum of a bordered row in float64; two chains of additions, because one would wait for itself."""
+    L = lanes(np.empty(0))
+    a = b = broadcast(np.empty(0), 0.0)
+    whole = width // (2 * L) * (2 * L)
+    for i in range(BORDER, BORDER + whole, 2 * L):
+        a, b = a + load_wide(values, i), b + load_wide(values, i + L)
+    total = lane_sum(a + b)
     for i in range(BORDER + whole, BORDER + width):
-        a += values[i]
-    return (a + b) + (c + d)
+        total += values[i]
+    return total
 
 
 @formula
@@ -161,8 +175,8 @@ def moments_along(rows, field, frame, ring, first, y):
         shift = square = middle * 0.0
         for k in range(1, REACH + 1):
             before, after = load(rows, begin + i - k) - middle, load(rows, begin + i + k) - middle
-            shift += (before + after) * frame.taps[REACH + k]
-            square += (before * before + after * after) * frame.taps[REACH + k]
+            shift += (before + after) * frame.taps[k]
+            square += (before * before + after * after) * frame.taps[k]
         store(ring, ring_row(first, y, frame) + i, middle + shift)
         store(ring, ring_row(first + 1, y, frame) + i, square - shift * shift)
 
@@ -175,8 +189,8 @@ def moments_down(ring, first, y, i, frame):
     for k in range(1, REACH + 1):
         above, below = ring_row(first, y - k, frame) + i, ring_row(first, y + k, frame) + i
         before, after = load(ring, above) - middle, load(ring, below) - middle
-        shift += (before + after) * frame.taps[REACH + k]
-        square += (before * before + after * after) * frame.taps[REACH + k]
+        shift += (before + after) * frame.taps[k]
+        square += (before * before + after * after) * frame.taps[k]
     return middle + shift, blur_down(ring, first + 1, y, i, frame) + (square - shift * shift)
 
 
