@@ -114,7 +114,7 @@ def on_screen(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:
     reach = 3 * torch.stack([c / det, a / det], dim=-1).sqrt()
     size = torch.tensor([camera.width, camera.height]).to(reach, non_blocking=True)
     inside = (splats.means + reach > 0) & (splats.means - reach < size)
-    return splats.drawn & inside.all(dim=-1)
+    return splats.drawn & inside[..., 0] & inside[..., 1]
 
 
 def condition(conics: Float[Tensor, "n 3"]) -> Float64[Tensor, " n"]:

@@ -388,6 +388,6 @@ def learning_rates(gaussians: Gaussians, rates: LearningRates, position: float) 
     each["log_scales"].fill_(rates.log_scales)
     each["quats"].fill_(rates.quats)
     each["opacity_logits"].fill_(rates.opacity_logits)
-    each["sh"][:, :1] = rates.sh_constant
-    each["sh"][:, 1:] = rates.sh_higher
+    each["sh"].fill_(rates.sh_higher)  # at once, which is faster than all bands but one
+    each["sh"][:, 0] = rates.sh_constant
     return result.flat
