@@ -128,7 +128,10 @@ def command() -> NoReturn:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is imported
     _open_streams()
     Console.on_broken_pipe = _say_no_more  # pyright: ignore[reportAttributeAccessIssue]
-    code = main()
+    try:
+        code = main()
+    except SystemExit as ended:  # by the parser, which has printed its help
+        code = ended.code
     try:
         sys.stdout.flush()
     except BrokenPipeError:

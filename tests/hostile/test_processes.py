@@ -209,5 +209,6 @@ def test_of_two_that_need_a_kernel_one_compiles_and_a_cut_file_is_compiled_anew(
 def test_output_that_nobody_reads_is_no_error(words):
     command = " ".join([*COMMAND, *words])
     for pipe in ("| true; exit ${PIPESTATUS[0]}", ">&-"):
-        done = subprocess.run(["bash", "-c", f"{command} {pipe}"], cwd=ROOT, capture_output=True, text=True)
+        call, buffered = ["bash", "-c", f"{command} {pipe}"], {**os.environ, "PYTHONUNBUFFERED": ""}
+        done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, env=buffered)
         assert done.returncode in ((0, 141) if words[1] == "--help" else (2,)) and "Traceback" not in done.stderr
