@@ -13,7 +13,7 @@ TOOLS := $(VENV)/.tools-installed
 # no-compile: a module is compiled when it is first imported; all of torch's take a minute
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 
-# also where Python is told not to keep what it compiles: the tests start it hundreds of times
+# modules are kept compiled where Python is told otherwise, too: the tests start it over and over
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: setup demo test types pytest test-everywhere test-release docs clean

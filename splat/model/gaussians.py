@@ -210,9 +210,8 @@ class Gaussians(ShortRepr):
             ends += torch.aminmax(self.filter_widths)
         low, high, least, *widths = torch.stack(ends).cpu().tolist()  # waits for a GPU once
         narrow, wide = widths or (0.0, 0.0)
-        return (
-            -largest <= low and high <= largest and least >= 1 / largest and narrow >= 0 and wide <= largest
-        )  # not of nan
+        # each is False of nan
+        return -largest <= low and high <= largest and least >= 1 / largest and narrow >= 0 and wide <= largest
 
     def _refuse(self, good: Tensor, name: str, quality: str, meaning: str) -> None:
         first = int((~good).nonzero()[0])

@@ -54,9 +54,6 @@ def _run(calls: list[tuple]) -> None:
 def over_range(size: int, kernel: Callable, *arguments) -> None:
     """kernel(start, stop, *arguments) over contiguous parts of range(size)."""
     parts = min(thread_count(), max(size, 1))
-    if parts == 1:  # without the list, which would be a tenth of a short kernel's time
-        kernel(0, size, *arguments)
-        return
     edges = [size * t // parts for t in range(parts + 1)]
     _run([(kernel, edges[t], edges[t + 1], *arguments) for t in range(parts)])
 

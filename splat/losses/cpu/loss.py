@@ -128,8 +128,7 @@ class CpuViewLoss(CpuImageLoss):
         gradient[:, self.frame.height :] = 0
         gradient[3] = 0
         value = self._sweep(*self._against(image), gradient.reshape(-1), *flat)
-        if wanted:
-            self._leave_margin(seconds)
+        self._leave_margin(seconds)
         return CpuLinearLoss(self, value, torch.from_numpy(gradient), image, *flat)
 
     def _leave_margin(self, planes: np.ndarray) -> None:

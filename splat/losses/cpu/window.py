@@ -117,9 +117,14 @@ def blur_along(rows, fields, frame, ring, first, y):
     for field in range(fields):
         begin, at = begin_of(rows, field, frame), ring_row(first + field, y, frame)
         for i in range(0, frame.stride, lanes(rows)):
-            p1, p2, p3, p4, p5, m1, m2, m3, m4, m5 = neighbours(rows, begin + i)
-            pairs = m1 + p1, m2 + p2, m3 + p3, m4 + p4, m5 + p5
-            store(ring, at + i, weighted(load(rows, begin + i), pairs, frame.taps))
+            store(ring, at + i, weighted(load(rows, begin + i), both_ways(rows, begin + i)[0], frame.taps))
+
+
+@formula
+def both_ways(array, at):
+    """F(x + t) + F(x - t) and F(x + t) - F(x - t) for t = 1 to 5."""
+    p1, p2, p3, p4, p5, m1, m2, m3, m4, m5 = neighbours(array, at)
+    return (p1 + m1, p2 + m2, p3 + m3, p4 + m4, p5 + m5), (p1 - m1, p2 - m2, p3 - m3, p4 - m4, p5 - m5)
 
 
 @formula

@@ -26,8 +26,9 @@ import numpy as np
 import torch
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, TILE_ROWS, load_pixels, neighbours, scratch, store_pixels
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, TILE_ROWS, load_pixels, scratch, store_pixels
 from splat.backend.cpu.simd import broadcast, fetch_and_increment, iota, lanes, load, store, store_sums
+from splat.losses.cpu.window import both_ways, weighted
 from splat.losses.formulas import CENTRE, ssim_second_dot
 from splat.losses.reference import REACH, window
 from splat.render.cpu.footprints import FOOTPRINT
@@ -42,10 +43,9 @@ TOGETHER = 4  # rows of windows that are blurred in one go
 RING = 16  # rows: a power of two, at least the window's 2 REACH and TOGETHER
 EDGE = 16  # floats of padding at either side of a row: at least a vector, and REACH
 FLUSH = 16  # rows
-MIDDLE, *TAPS = (float(tap) for tap in window(torch.float64)[REACH:])
-TAPS = tuple(TAPS)
-# taps of B_1 and B_2
-FIRST, SECOND = (tuple((k + 1) ** power * tap for k, tap in enumerate(TAPS)) for power in (1, 2))
+TAPS = tuple(float(tap) for tap in window(torch.float64)[REACH:])
+# taps of B_1 and B_2, without the middle ones, which are 0
+FIRST, SECOND = (tuple(k**power * tap for k, tap in enumerate(TAPS) if k) for power in (1, 2))
 
 
 @kernel
@@ -246,17 +246,9 @@ def dot5(x, taps):
 
 
 @formula
-def both_ways(array, at):
-    """F(x + t) + F(x - t) and F(x + t) - F(x - t) for t = 1 to 5."""
-    p1, p2, p3, p4, p5, m1, m2, m3, m4, m5 = neighbours(array, at)
-    return (p1 + m1, p2 + m2, p3 + m3, p4 + m4, p5 + m5), (p1 - m1, p2 - m2, p3 - m3, p4 - m4, p5 - m5)
-
-
-@formula
 def blurred(F):
     """The middle of eleven rows, blurred."""
-    sums = (F[6] + F[4], F[7] + F[3], F[8] + F[2], F[9] + F[1], F[10] + F[0])
-    return F[5] * MIDDLE + dot5(sums, TAPS)
+    return weighted(F[5], (F[6] + F[4], F[7] + F[3], F[8] + F[2], F[9] + F[1], F[10] + F[0]), TAPS)
 
 
 @formula
@@ -313,10 +305,10 @@ def blur_row(rows, at, pitch, u, along, moved, to):
     L = lanes(rows)
     # D f: B_0, B_1 and B_2 from the sums and differences at equal distances
     s, d = both_ways(rows, at)
-    B0, B1, B2 = load(rows, at) * MIDDLE + dot5(s, TAPS), along * dot5(d, FIRST), along * along * dot5(s, SECOND)
+    B0, B1, B2 = weighted(load(rows, at), s, TAPS), along * dot5(d, FIRST), along * along * dot5(s, SECOND)
     # D f v: the same without the second power of u
     s, d = both_ways(rows, at + pitch)
-    C0, C1 = load(rows, at + pitch) * MIDDLE + dot5(s, TAPS), along * dot5(d, FIRST)
+    C0, C1 = weighted(load(rows, at + pitch), s, TAPS), along * dot5(d, FIRST)
     uB = u * B0 + B1
     # slopes D, D u, D v, D u^2, D u v; then D v^2 and w, which have no u
     store(moved, to, B0)
@@ -326,7 +318,7 @@ def blur_row(rows, at, pitch, u, along, moved, to):
     store(moved, to + 4 * L, u * C0 + C1)
     for field in range(2, 4):
         at_field = at + field * pitch
-        store(moved, to + (3 + field) * L, load(rows, at_field) * MIDDLE + dot5(both_ways(rows, at_field)[0], TAPS))
+        store(moved, to + (3 + field) * L, weighted(load(rows, at_field), both_ways(rows, at_field)[0], TAPS))
 
 
 @formula
