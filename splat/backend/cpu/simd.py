@@ -13,6 +13,7 @@ any width and type: the array that a vector is loaded from decides its dtype, an
     x < y ..., m & n, m | n         masks;  select(m, x, y), of numbers and duals too;  any_lane(m)
     load_all(a, i, k), store_all(a, i, t)   a tuple of k vectors, one behind the other; k is a constant
     load_wide(a, i)                 numbers of any type in a vector of float64, of as many lanes as that has
+    load_double(a, i), store_double(a, i, x)   one number of float64, which takes the place of two of float32
     store_sums(a, i, (v0, ...))     the sum over the lanes of each vector to a[i], a[i+1], ...;  lane_sum(v) of one
     prefetch(a, i)                  hint that a[i] will be read soon; no effect on results
 
@@ -62,7 +63,7 @@ REGISTER_BITS = _register_bits()
 keep_kernels(REGISTER_BITS)
 # of a template: tried before Numba's own for the same function, which are of any target: that saves 8% of compilation
 FIRST = {"target": "cpu"}
-I32, I64, F32 = ir.IntType(32), ir.IntType(64), ir.FloatType()
+I32, I64, F32, DOUBLE = ir.IntType(32), ir.IntType(64), ir.FloatType(), ir.DoubleType()
 
 
 def lanes_of(dtype: np.dtype | type) -> int:
@@ -80,7 +81,7 @@ class VectorType(types.Type):
 
     @property
     def scalar_ir(self) -> ir.Type:
-        return ir.FloatType() if self.bits == 32 else ir.DoubleType()
+        return F32 if self.bits == 32 else DOUBLE
 
     @property
     def llvm(self) -> ir.VectorType:
@@ -297,6 +298,26 @@ def load_all(typing, array, index, count):
 
 
 @intrinsic
+def load_double(typing, array, index):
+    def generate(context, builder, sig, args):
+        value = builder.load(builder.bitcast(address_of(context, builder, sig, args), DOUBLE.as_pointer()))
+        value.align = array.dtype.bitwidth // 8
+        return value
+
+    return types.float64(array, index), generate
+
+
+@intrinsic
+def store_double(typing, array, index, number):
+    def generate(context, builder, sig, args):
+        address = builder.bitcast(address_of(context, builder, sig, args), DOUBLE.as_pointer())
+        builder.store(args[2], address).align = array.dtype.bitwidth // 8
+        return context.get_dummy_value()
+
+    return types.void(array, index, types.float64), generate
+
+
+@intrinsic
 def prefetch(typing, array, index):
     def generate(context, builder, sig, args):
         address = builder.bitcast(address_of(context, builder, sig, args), ir.IntType(8).as_pointer())
@@ -312,36 +333,42 @@ def store_sums(typing, array, index, vectors):
     vector = VectorType(array.dtype)
 
     def generate(context, builder, sig, args):
-        address = address_of(context, builder, sig, args)
-        values = cgutils.unpack_tuple(builder, args[2])
-        for start in range(0, len(values), 4):
-            group = values[start : start + 4]
-            sums = _sums_of_four(builder, vector, group + [vector.constant(0)] * (4 - len(group)))
-            for j in range(len(group)):
-                builder.store(builder.extract_element(sums, I32(j)), builder.gep(address, [I64(start + j)]))
+        address, values = address_of(context, builder, sig, args), cgutils.unpack_tuple(builder, args[2])
+        at = 0
+        while at < len(values):
+            # as many vectors as a tree can take
+            count = min(1 << (len(values) - at).bit_length() - 1, vector.lanes)
+            sums = _sums_of(builder, values[at : at + count])
+            place = builder.gep(address, [I64(at)])
+            builder.store(sums, builder.bitcast(place, sums.type.as_pointer())).align = vector.bits // 8
+            at += count
         return context.get_dummy_value()
 
     return types.void(array, index, vectors), generate
 
 
-def _sums_of_four(builder, vector, values):
-    """A vector whose first four elements are the sums of four vectors: a transpose-and-add tree, 3 adds for 4 sums."""
+def _sums_of(builder, values):
+    """The sum over the lanes of each vector, as one vector; as many vectors as a power of two, at most one a lane.
 
-    def shuffle(x, y, index):
-        return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(I32, len(index)), index))
+    Two vectors become one, whose lanes hold sums of half of the lanes of either: a transposition that adds.
+    """
 
-    n = vector.lanes
-    while n > 4:  # halve the vectors first, so that the tree works on the narrowest registers
-        low, high = list(range(n // 2)), list(range(n // 2, n))
-        values = [builder.fadd(shuffle(v, v, low), shuffle(v, v, high)) for v in values]
-        n //= 2
-    if n == 2:
-        pairs = [builder.fadd(shuffle(v, w, [0, 2]), shuffle(v, w, [1, 3])) for v, w in (values[:2], values[2:])]
-        return shuffle(pairs[0], pairs[1], [0, 1, 2, 3])
-    pairs = [
-        builder.fadd(shuffle(v, w, [0, 4, 1, 5]), shuffle(v, w, [2, 6, 3, 7])) for v, w in (values[:2], values[2:])
-    ]
-    return builder.fadd(shuffle(pairs[0], pairs[1], [0, 1, 4, 5]), shuffle(pairs[0], pairs[1], [2, 3, 6, 7]))
+    def shuffle(x, y, lanes):
+        return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
+
+    n, places, step = values[0].type.count, [0], values[0].type.count
+    while step > 1:
+        step //= 2
+        low = [lane if not lane & step else n + lane - step for lane in range(n)]
+        high = [lane + step if not lane & step else n + lane for lane in range(n)]
+        if len(values) > 1:
+            pairs = zip(values[::2], values[1::2], strict=True)
+            values = [builder.fadd(shuffle(x, y, low), shuffle(x, y, high)) for x, y in pairs]
+            places += [place + step for place in places]
+        else:
+            (x,) = values
+            values = [builder.fadd(x, shuffle(x, x, [lane ^ step for lane in range(n)]))]
+    return shuffle(values[0], values[0], places)
 
 
 # --- functions of vectors ---------------------------------------------------------------------------------------------
@@ -352,8 +379,7 @@ def lane_sum(typing, x):
     """The sum over the lanes, in a fixed tree."""
 
     def generate(context, builder, sig, args):
-        (vector,) = sig.args
-        return builder.extract_element(_sums_of_four(builder, vector, [args[0], *[vector.constant(0)] * 3]), I32(0))
+        return builder.extract_element(_sums_of(builder, list(args)), I32(0))
 
     return x.dtype(x), generate
 

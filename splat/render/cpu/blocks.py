@@ -32,6 +32,7 @@ from splat.render.cpu.tile import (
     dark,
     intersection,
     intersections_of,
+    kept_at,
     load3,
     load_planes,
     next_tile,
@@ -57,7 +58,7 @@ def block_moments(counter, params, lists, frame, pixels, v_planes, curvature, su
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
             b, p = BLOCK * L * y, row_at(corner, y, frame)
-            begin_undo_row(state, b, L, frame, pixels, p)
+            begin_undo_row(state, b, L, frame, pixels, kept_at(tile, y, L))
             store3(state, b + GRAD * L, L, load_planes(v_planes, p, frame))
             store3(state, b + CURVATURE * L, L, load_planes(curvature, p, frame))
         first, count = intersections_of(lists, tile)

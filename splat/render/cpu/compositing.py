@@ -9,7 +9,7 @@ e, k     an intersection: its place in all lists, and its number in its tile, 0 
 u, v     whitened offset of a pixel from the splat's mean: u is the same in all rows of a tile, v follows by `row_v`
 terms    what gives v and log2 alpha of any row of the tile (`tile.alpha_terms`)
 top, bottom   the first row that the splat touches, and one past the last
-b, p     where a row begins: in `state`, and in a plane of the picture
+b, p, kept   where a row begins: in `state`, in a plane of the picture, and in what lies tile by tile (`tile.Pixels`)
 T, STOP, IMAGE, REST, GRAD   in code, the vectors of a row in `state`, by number (a colour takes three): T lies at b + T * L;
          a row has FORWARD or BACKWARD of them
 T        in formulas, transmittance; `forward` keeps -T in front of the splat that stopped a pixel: its sign says "stopped"
@@ -19,15 +19,7 @@ v_x      cotangent: the loss's derivative in x
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import (
-    PIXEL_ROWS,
-    TILE_ROWS,
-    load_pixels,
-    pixel_columns,
-    pixel_rows,
-    scratch,
-    store_pixels,
-)
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_ROWS, pixel_columns, pixel_rows, scratch
 from splat.backend.cpu.simd import any_lane, broadcast, fma, lanes, load, maximum, prefetch, select, store
 from splat.render.cpu.tile import (
     AHEAD,
@@ -46,6 +38,7 @@ from splat.render.cpu.tile import (
     dark,
     intersection,
     intersections_of,
+    kept_at,
     load3,
     load_cotangent,
     next_tile,
@@ -90,7 +83,7 @@ def forward(counter, params, lists, frame, pixels):
         furthest = broadcast(params, 0.0)
         for y in range(TILE_ROWS):
             furthest = maximum(furthest, load(state, (FORWARD * y + STOP) * L))
-            end_row(state, FORWARD * L * y, L, frame, pixels, row_at(corner, y, frame))
+            end_row(state, FORWARD * L * y, L, frame, pixels, row_at(corner, y, frame), kept_at(tile, y, L))
         store(state, 0, furthest)
         pixels.reached[tile] = np.int64(min(count, state[:L].max()))
         tile = next_tile(counter, lists)
@@ -100,34 +93,33 @@ def forward(counter, params, lists, frame, pixels):
 def composite(params, lists, e, k, x0, y0, frame, state):
     """Composite intersection e, number k of its tile; True if it stopped a pixel."""
     L = lanes(params)
-    _splat, _u, terms, colour, _index, top, bottom = intersection(params, lists, e, k, x0, y0)
-    stopped = False
+    _splat, _u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
+    zero = broadcast(params, 0.0)
+    ended = zero > zero
     for y in range(top, bottom):
         b = FORWARD * L * y
         before = load(state, b + T * L)
         # alpha of the row, 0 where the pixel has stopped
         alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, before > 0.0, frame.cap)
-        w = alpha * before
         after = fma(-alpha, before, before)  # T - alpha T, rounded once
-        ends = (after < frame.floor) & (before > 0.0)
-        if any_lane(ends):  # these pixels stop in front of the splat
-            w = select(ends, 0.0, w)
-            after = select(ends, -before, after)
-            store(state, b + STOP * L, select(ends, k, load(state, b + STOP * L)))
-            stopped = True
+        w = select(after >= frame.floor, alpha * before, 0.0)
+        # other pixels stop in front of the splat, if they have not before; a branch would often be mispredicted
+        ends = (before > 0.0) & (after < frame.floor)
+        ended = ended | ends
+        store(state, b + STOP * L, select(ends, index, load(state, b + STOP * L)))
         # image += w c, T -= w (or its sign turns), with the splat's colour c
-        store(state, b + T * L, after)
+        store(state, b + T * L, select(ends, -before, after))
         store3(state, b + IMAGE * L, L, plus(load3(state, b + IMAGE * L, L), w, colour))
-    return stopped
+    return any_lane(ended)
 
 
 @formula
-def end_row(state, b, L, frame, pixels, p):
-    """Add the background to a row, and write its colour, alpha, final T and stops at p of each plane."""
+def end_row(state, b, L, frame, pixels, p, kept):
+    """Add the background to a row, and write its colour and alpha at p of each plane, its final T and stops at `kept`."""
     # the final T, of stopped pixels too
     last = maximum(load(state, b + T * L), -load(state, b + T * L))
-    store_pixels(pixels.transmittance, p, frame.stride, last)
-    store_pixels(pixels.stop, p, frame.stride, load(state, b + STOP * L))
+    store(pixels.transmittance, kept, last)
+    store(pixels.stop, kept, load(state, b + STOP * L))
     image = plus(load3(state, b + IMAGE * L, L), last, frame.background)
     store_planes(pixels.planes, p, frame, image, 1.0 - last)
 
@@ -157,8 +149,8 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
             # behind all splats: the final T, and R of the background
-            p = row_at(corner, y, frame)
-            begin_backward_row(state, BACKWARD * L * y, L, frame, pixels, v_planes, p)
+            p, kept = row_at(corner, y, frame), kept_at(tile, y, L)
+            begin_backward_row(state, BACKWARD * L * y, L, frame, pixels, v_planes, p, kept)
         first, count = intersections_of(lists, tile)
         # a tile without cotangent adds nothing
         if dark(v_planes, 0, 4, corner, frame):
@@ -174,11 +166,11 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
 
 
 @formula
-def begin_backward_row(state, b, L, frame, pixels, v_planes, p):
+def begin_backward_row(state, b, L, frame, pixels, v_planes, p, kept):
     """Start a row behind all splats: the final T, where it stopped, R of the background, v_image."""
-    last, v_pixel = load_pixels(pixels.transmittance, p, frame.stride), load_cotangent(v_planes, p, frame)
+    last, v_pixel = load(pixels.transmittance, kept), load_cotangent(v_planes, p, frame)
     store(state, b + T * L, last)
-    store(state, b + STOP * L, load_pixels(pixels.stop, p, frame.stride))
+    store(state, b + STOP * L, load(pixels.stop, kept))
     store(state, b + REST * L, last * behind_all(v_pixel, frame.background))
     store3(state, b + GRAD * L, L, v_pixel)
 

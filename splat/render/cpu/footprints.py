@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import TILE_ROWS, load_pixels, scratch
+from splat.backend.cpu.memory import TILE_ROWS, scratch
 from splat.backend.cpu.simd import broadcast, lanes, load, maximum, select, store
 from splat.render.cpu.tile import (
     BEHIND,
@@ -22,9 +22,9 @@ from splat.render.cpu.tile import (
     corner_of,
     intersection,
     intersections_of,
+    kept_at,
     load3,
     next_tile,
-    row_at,
     row_range,
     row_v,
     store3,
@@ -75,9 +75,9 @@ def find_footprints(counter, params, lists, frame, pixels, footprints, begin, en
     state = scratch(params, UNDO * L * TILE_ROWS)
     tile = next_tile(counter, lists)
     while tile >= 0:
-        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        x0, y0, _corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            begin_undo_row(state, UNDO * L * y, L, frame, pixels, row_at(corner, y, frame))
+            begin_undo_row(state, UNDO * L * y, L, frame, pixels, kept_at(tile, y, L))
         first, count = intersections_of(lists, tile)
         for k in range(count - 1, -1, -1):
             a = lists.accumulator[first + k]
@@ -112,10 +112,9 @@ def find_neighbours(counter, params, lists, frame, pixels, covered, before):
     state, row = scratch(params, 2 * L * TILE_ROWS), scratch(params, L)  # state: stop, last intersection with weight
     tile = next_tile(counter, lists)
     while tile >= 0:
-        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        x0, y0, _corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            p = row_at(corner, y, frame)
-            store(state, 2 * L * y, load_pixels(pixels.stop, p, frame.stride))
+            store(state, 2 * L * y, load(pixels.stop, kept_at(tile, y, L)))
             store(state, (2 * y + 1) * L, -1.0)
         first, count = intersections_of(lists, tile)
         for k in range(count):

@@ -8,16 +8,10 @@ from math import log2
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
+from splat.backend.cpu.simd import store_double
 from splat.projection.whitening import LOG2_E, put, whitening
-from splat.render.cpu.tile import ACROSS, ALONG, CUT, LO, MX, MY, PARAMS, RED, SHEAR
+from splat.render.cpu.tile import ACROSS, ALONG, CUT, LO, MX, MY, PARAMS, RED, SHEAR, STEP
 from splat.render.formulas import SPLAT, second_order
-
-
-@formula
-def put_exactly(params, at, x):
-    """A double as the number next to it and the rest."""
-    params[at] = x
-    params[at + 1] = x - params[at]
 
 
 @kernel
@@ -25,10 +19,15 @@ def pack_splats(start, stop, splats, log2_alpha_min, contour, params):
     """params (n * PARAMS) of splats (n, 9)."""
     for i in range(start, stop):
         p, opacity = PARAMS * i, splats[i, 5]
-        put_exactly(params, p + MX, splats[i, 0] - 0.5)
-        put_exactly(params, p + MY, splats[i, 1] - 0.5)
-        params[p + ALONG], params[p + ACROSS], shear = whitening(splats[i])
-        put_exactly(params, p + SHEAR, shear)
+        along, across, shear = whitening(splats[i])
+        store_double(params, p + MX, splats[i, 0] - 0.5)
+        store_double(params, p + MY, splats[i, 1] - 0.5)
+        store_double(params, p + SHEAR, shear)
+        params[p + ALONG], params[p + ACROSS], params[p + STEP] = (
+            along,
+            across,
+            shear * np.float64(params.dtype.type(across)),
+        )
         level = log2(opacity) if opacity > 0 else -np.inf
         params[p + LO] = level
         params[p + CUT] = max(log2_alpha_min, level - LOG2_E / 2 * contour * contour)

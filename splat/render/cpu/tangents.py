@@ -9,7 +9,7 @@ those of a tangent K times.
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import TILE_ROWS, load_pixels, scratch, store_pixels
+from splat.backend.cpu.memory import TILE_ROWS, scratch
 from splat.backend.cpu.simd import fma, lanes, load, prefetch, select, store
 from splat.render.cpu.compositing import begin_backward_row
 from splat.render.cpu.tile import (
@@ -33,6 +33,7 @@ from splat.render.cpu.tile import (
     dark,
     intersection,
     intersections_of,
+    kept_at,
     load3,
     load_cotangent,
     next_tile,
@@ -69,8 +70,7 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
             store(state, width * y + T * L, 1.0)
-            p = row_at(corner, y, frame)
-            store(state, width * y + STOP * L, load_pixels(pixels.stop, p, frame.stride))
+            store(state, width * y + STOP * L, load(pixels.stop, kept_at(tile, y, L)))
             for j in range(2, 2 + TANGENT * K):
                 store(state, width * y + j * L, 0.0)
         first, count = intersections_of(lists, tile)
@@ -84,17 +84,17 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
             else:
                 tangent_block(params, tangents, K, lists, first + k, k, x0, y0, frame, state, shared)
         for y in range(TILE_ROWS):
-            p = row_at(corner, y, frame)
+            p, kept = row_at(corner, y, frame), kept_at(tile, y, L)
             for i in range(K):
-                end_tangent_row(state, width * y + (2 + TANGENT * i) * L, L, frame, planes, transmittances, i, p)
+                end_tangent_row(state, width * y + (2 + TANGENT * i) * L, L, frame, planes, transmittances, i, p, kept)
         tile = next_tile(counter, lists)
 
 
 @formula
-def end_tangent_row(state, b, L, frame, planes, transmittances, i, p):
+def end_tangent_row(state, b, L, frame, planes, transmittances, i, p, kept):
     """Add the background's part to a row of tangent i, and write it to the planes."""
     dT = load(state, b + DT * L)
-    store_pixels(transmittances, i * frame.size + p, frame.stride, dT)
+    store(transmittances, i * frame.size + kept, dT)
     dimage = plus(load3(state, b + DIMAGE * L, L), dT, frame.background)
     store_planes(planes, 4 * i * frame.size + p, frame, dimage, -dT)
 
@@ -165,11 +165,11 @@ def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, 
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            p = row_at(corner, y, frame)
-            begin_backward_row(state, width * y, L, frame, pixels, v_planes, p)
+            p, kept = row_at(corner, y, frame), kept_at(tile, y, L)
+            begin_backward_row(state, width * y, L, frame, pixels, v_planes, p, kept)
             for i in range(K):
                 b = width * y + (BACKWARD + BACKWARD_TANGENT * i) * L
-                begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_planes, i, p)
+                begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_planes, i, p, kept)
         first, count = intersections_of(lists, tile)
         plain = dark(v_planes, 0, 4, corner, frame)
         if plain and dark(dv_planes, 0, 4 * K, corner, frame):
@@ -190,10 +190,9 @@ def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, 
 
 
 @formula
-def begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_planes, i, p):
+def begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_planes, i, p, kept):
     """Start tau, R' and v_image' of tangent i behind all splats, for the row of pixels at p."""
-    last = load_pixels(pixels.transmittance, p, frame.stride)
-    dT = load_pixels(transmittances, i * frame.size + p, frame.stride)
+    last, dT = load(pixels.transmittance, kept), load(transmittances, i * frame.size + kept)
     v_pixel = load_cotangent(v_planes, p, frame)
     dv_pixel = load_cotangent(dv_planes, 4 * i * frame.size + p, frame)
     # tau = T' / T, and R = T (v_image . background + ...) differentiated

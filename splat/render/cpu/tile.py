@@ -22,19 +22,32 @@ from splat.backend.cpu.memory import (
     pixel_rows,
     store_pixels,
 )
-from splat.backend.cpu.simd import any_lane, broadcast, fetch_and_increment, fma, load, select, store, store_sums
+from splat.backend.cpu.simd import (
+    any_lane,
+    broadcast,
+    fetch_and_increment,
+    fma,
+    load,
+    load_double,
+    select,
+    store,
+    store_sums,
+)
 from splat.render.formulas import SPLAT, along_row, alpha_row, column_terms, reciprocal, row_terms
 
 NEVER = 1e30  # the stop index of a pixel that does not stop
 AHEAD = 6  # intersections between a prefetch and its use
 
-PARAMS = 16  # one cache line in float32: mean x, y (pixel index units), the whitening, LO = log2 o; _REST: of a rounded number
-MX, MX_REST, MY, MY_REST, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT = range(13)
+# A splat's numbers, one cache line in float32: in float64 its mean x, y (pixel index units) and the whitening's shear; then the
+# rest of the whitening, a column's step of v, LO = log2 o, colour, cut
+PARAMS = 16
+MX, MY, SHEAR = 0, 2, 4
+ALONG, ACROSS, STEP, LO, RED, GREEN, BLUE, CUT = range(6, 14)
 
 # The vectors that a kernel keeps of a row of pixels, in this order; a number is the first of its channels.
 T, STOP = 0, 1  # transmittance, and the index of the intersection at which a pixel stops
 IMAGE, FORWARD = 2, 5
-REST, GRAD, BACKWARD = 2, 3, 6  # R (not to be taken for the _REST of a rounded number) and v_image
+REST, GRAD, BACKWARD = 2, 3, 6  # R and v_image
 BEHIND, UNDO = 2, 5  # the colour behind, of the passes in `blocks.py` and `footprints.py`
 DT, DIMAGE, TANGENT = 0, 1, 4  # after T and STOP, for each of K tangents
 TAU, DREST, DGRAD, BACKWARD_TANGENT = 0, 1, 2, 5  # after those of `backward`, for each of K tangents
@@ -82,7 +95,8 @@ class Frame(NamedTuple):
 class Pixels(NamedTuple):
     """Results of `forward` in each pixel: planes (red, green, blue, alpha), the final T, and where it stopped.
 
-    Pixels beyond the image stop in front of all splats.  reached: (tiles,) how many intersections some pixel reaches.
+    The last two are for kernels alone, and lie tile by tile, row by row (`kept_at`).  Pixels beyond the image stop in front of
+    all splats.  reached: (tiles,) how many intersections some pixel reaches.
     """
 
     planes: np.ndarray
@@ -112,6 +126,12 @@ def row_at(corner, y, frame):
 
 
 @formula
+def kept_at(tile, y, L):
+    """Index of a tile's row y in what lies tile by tile."""
+    return (tile * TILE_ROWS + y) * L
+
+
+@formula
 def row_range(packed):
     """First row and one past the last row of an intersection."""
     return packed & 255, ((packed >> 8) & 255) + 1
@@ -120,7 +140,7 @@ def row_range(packed):
 @formula
 def column_u(params, o, x0, columns):
     """u of columns, counted from x0; the mean is in double precision, as in `alpha_terms`."""
-    dx = x0 - np.float64(params[o + MX]) - params[o + MX_REST]
+    dx = x0 - load_double(params, o + MX)
     return fma(columns, params[o + ALONG], params[o + ALONG] * dx)
 
 
@@ -132,14 +152,12 @@ def alpha_terms(params, o, x0, y0):
     """
     # whitened offset of a pixel (dx, dy): u = along dx, v = across (shear dx + dy)
     across = params[o + ACROSS]
-    shear = np.float64(params[o + SHEAR]) + params[o + SHEAR_REST]
-    # from the mean to the tile's corner; the rest of each rounded number is added
-    dx = x0 - np.float64(params[o + MX]) - params[o + MX_REST]
-    dy = y0 - np.float64(params[o + MY]) - params[o + MY_REST]
+    # from the mean to the tile's corner
+    dx, dy = x0 - load_double(params, o + MX), y0 - load_double(params, o + MY)
     # the columns are 0, 1, ... pixels from the corner; a row of pixels adds `across` to v
     columns = pixel_columns(params)
     u = column_u(params, o, x0, columns)
-    v = fma(columns, across * shear, across * (shear * dx + dy))
+    v = fma(columns, params[o + STEP], across * (load_double(params, o + SHEAR) * dx + dy))
     v = fma(pixel_rows(params), across, v)
     terms = (v, broadcast(params, across), fma(-u, u, params[o + LO]), broadcast(params, params[o + CUT]))
     return u, terms
@@ -165,11 +183,11 @@ def row_v(frame, L, y, terms):
 
 
 @formula
-def begin_undo_row(state, b, L, frame, pixels, p):
-    """Start a row behind all splats: T, STOP, and the background's colour times T."""
-    last = load_pixels(pixels.transmittance, p, frame.stride)
+def begin_undo_row(state, b, L, frame, pixels, kept):
+    """Start a row behind all splats: T, STOP, and the background's colour times T.  kept: of `kept_at`."""
+    last = load(pixels.transmittance, kept)
     store(state, b + T * L, last)
-    store(state, b + STOP * L, load_pixels(pixels.stop, p, frame.stride))
+    store(state, b + STOP * L, load(pixels.stop, kept))
     for c in range(3):
         store(state, b + (BEHIND + c) * L, last * frame.background[c])
 

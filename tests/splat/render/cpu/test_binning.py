@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, TILE_ROWS
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_ROWS
 from splat.backend.cpu.simd import lanes_of
 from splat.model.settings import RenderSettings
 from splat.render.cpu.binning import bin_splats, depth_order, heaviest_first, radix_argsort
@@ -30,8 +30,8 @@ def test_the_radix_sort_orders_every_bit():
     assert (radix_argsort(keys.copy(), np.arange(3000, dtype=np.int32)) == expected).all()
 
 
-def test_the_heaviest_tile_comes_first():
-    assert heaviest_first(np.array([3, 9, 1, 9])).tolist() == [1, 3, 0, 2]
+def test_the_heaviest_row_of_tiles_comes_first():
+    assert heaviest_first(np.array([3, 1, 9, 0, 2, 6]), 2).tolist() == [2, 3, 4, 5, 0, 1]
 
 
 def test_a_faint_splat_whose_determinant_rounds_to_zero_is_in_no_tile():
@@ -94,12 +94,7 @@ def test_tiles_are_handed_out_once_each():
 
 def test_entries_that_no_pixel_reaches_are_dropped_and_the_others_numbered_splat_by_splat():
     raster = truth("walled").raster(DTYPES[0])
-    before, columns = raster.lists, raster.frame.columns
-    stops = (
-        raster.pixels.stop.reshape(-1, TILE_HEIGHT, columns, lanes_of(np.float32) // PIXEL_ROWS)
-        .max(axis=(1, 3))
-        .reshape(-1)
-    )
+    before, stops = raster.lists, raster.pixels.stop.reshape(raster.lists.start.size - 1, -1).max(axis=1)
     after, start = raster.reached
     assert after.splat.size < before.splat.size
     for tile, stop in enumerate(stops):
