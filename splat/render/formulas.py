@@ -235,10 +235,10 @@ def rows_in_strip(splat, level, det, ey, left, right):
     """Lowest and highest y, relative to the mean, of a bounded ellipse in the strip left <= x <= right (relative too)."""
     b, c = splat[3], splat[4]
     x_top = -b * ey / splat[2]  # where the ellipse is highest; it is lowest at -x_top
-    x = min(max(x_top, left), right)
-    high = (-b * x + sqrt(max(0.0, c * level - det * x * x))) / c
+    x, r = min(max(x_top, left), right), reciprocal(c)
+    high = (sqrt(max(0.0, c * level - det * x * x)) - b * x) * r
     x = min(max(-x_top, left), right)
-    low = (-b * x - sqrt(max(0.0, c * level - det * x * x))) / c
+    low = (sqrt(max(0.0, c * level - det * x * x)) + b * x) * -r
     return low, high
 
 

@@ -19,6 +19,8 @@ a: an array of floats, C-contiguous; `at` counts its numbers.
 # pyright: reportOptionalCall=false
 # (numba declares its decorators as None until they are set up)
 
+from contextlib import suppress
+from ctypes import CDLL
 from math import prod
 
 import numpy as np
@@ -44,6 +46,21 @@ from splat.backend.cpu.simd import (
 PIXEL_ROWS = 2  # of a vector of pixels
 TILE_ROWS = 32  # vectors of pixels, one below the other
 TILE_HEIGHT = PIXEL_ROWS * TILE_ROWS
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+
+
+def _keep_what_is_freed() -> None:
+    """Make glibc keep freed memory for the next array: given back, a step's would be asked for page by page at the next one.
+
+    A 16th of a step at 504 x 378.  Arrays of 32 MiB and more are still given back, as is what lies above 256 MiB.
+    """
+    with suppress(AttributeError):  # another C library
+        mallopt = CDLL(None).mallopt
+        for name, size in ((M_MMAP_THRESHOLD, 1 << 25), (M_TRIM_THRESHOLD, 1 << 28)):
+            mallopt(name, size)
+
+
+_keep_what_is_freed()
 
 
 @formula
