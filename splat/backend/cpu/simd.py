@@ -334,14 +334,12 @@ def store_sums(typing, array, index, vectors):
 
     def generate(context, builder, sig, args):
         address, values = address_of(context, builder, sig, args), cgutils.unpack_tuple(builder, args[2])
-        at = 0
-        while at < len(values):
-            # as many vectors as a tree can take
-            count = min(1 << (len(values) - at).bit_length() - 1, vector.lanes)
-            sums = _sums_of(builder, values[at : at + count])
-            place = builder.gep(address, [I64(at)])
-            builder.store(sums, builder.bitcast(place, sums.type.as_pointer())).align = vector.bits // 8
-            at += count
+        while values:
+            # as many as a tree can take
+            count = min(1 << len(values).bit_length() - 1, vector.lanes)
+            sums, values = _sums_of(builder, values[:count]), values[count:]
+            builder.store(sums, builder.bitcast(address, sums.type.as_pointer())).align = vector.bits // 8
+            address = builder.gep(address, [I64(count)])
         return context.get_dummy_value()
 
     return types.void(array, index, vectors), generate
@@ -356,9 +354,8 @@ def _sums_of(builder, values):
     def shuffle(x, y, lanes):
         return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
 
-    n, places, step = values[0].type.count, [0], values[0].type.count
-    while step > 1:
-        step //= 2
+    n, places = values[0].type.count, [0]
+    for step in (n >> k for k in range(1, n.bit_length())):
         low = [lane if not lane & step else n + lane - step for lane in range(n)]
         high = [lane + step if not lane & step else n + lane for lane in range(n)]
         if len(values) > 1:
@@ -366,8 +363,7 @@ def _sums_of(builder, values):
             values = [builder.fadd(shuffle(x, y, low), shuffle(x, y, high)) for x, y in pairs]
             places += [place + step for place in places]
         else:
-            (x,) = values
-            values = [builder.fadd(x, shuffle(x, x, [lane ^ step for lane in range(n)]))]
+            values = [builder.fadd(values[0], shuffle(*values, *values, [lane ^ step for lane in range(n)]))]
     return shuffle(values[0], values[0], places)
 
 

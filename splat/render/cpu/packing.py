@@ -23,11 +23,8 @@ def pack_splats(start, stop, splats, log2_alpha_min, contour, params):
         store_double(params, p + MX, splats[i, 0] - 0.5)
         store_double(params, p + MY, splats[i, 1] - 0.5)
         store_double(params, p + SHEAR, shear)
-        params[p + ALONG], params[p + ACROSS], params[p + STEP] = (
-            along,
-            across,
-            shear * np.float64(params.dtype.type(across)),
-        )
+        params[p + ALONG], params[p + ACROSS] = along, across
+        params[p + STEP] = shear * np.float64(params[p + ACROSS])
         level = log2(opacity) if opacity > 0 else -np.inf
         params[p + LO] = level
         params[p + CUT] = max(log2_alpha_min, level - LOG2_E / 2 * contour * contour)

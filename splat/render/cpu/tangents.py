@@ -59,7 +59,7 @@ from splat.render.formulas import (
 
 @kernel
 def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittances):
-    """J u for K tangents: their planes (K, 4 planes) and the tangents of the final transmittance (K planes)."""
+    """J u for K tangents: their planes (K, 4 planes) and the tangents of the final transmittances, as these in `Pixels`."""
     L = lanes(params)
     K = transmittances.size // frame.size
     width = (2 + TANGENT * K) * L
