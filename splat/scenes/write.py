@@ -32,7 +32,7 @@ def bytes_of(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
 def png(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
     """Content of a PNG file."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="PNG")
+    Image.fromarray(picture).save(buffer, format="PNG", compress_level=2)  # 3% larger than at 6, in 40% of the time
     return buffer.getvalue()
 
 

@@ -157,17 +157,17 @@ def keep_reached(lists, kept_start, splat_of, rows, accumulator, splat_start):
         following[splat_of[e]] += 1
 
 
-def reached_lists(lists: Lists, reached: np.ndarray, n: int, columns: int) -> tuple[Lists, np.ndarray]:
+def reached_lists(lists: Lists, reached: np.ndarray, n: int) -> tuple[Lists, np.ndarray]:
     """The lists without the intersections behind each tile's last stop, with accumulators; and splat_start (n + 1,).
 
-    reached: (tiles,) how many intersections of each tile some pixel reaches; columns: tiles in a row.
+    reached: (tiles,) how many intersections of each tile some pixel reaches.
     """
     start = np.zeros(reached.size + 1, np.int64)
     np.cumsum(reached, out=start[1:])
     splat_of, rows, accumulator = (np.empty(start[-1], np.int32) for _ in range(3))
     splat_start = np.empty(n + 1, np.int64)
     keep_reached(lists, start, splat_of, rows, accumulator, splat_start)
-    return Lists(start, splat_of, rows, accumulator, heaviest_first(reached, columns)), splat_start
+    return Lists(start, splat_of, rows, accumulator, lists.order), splat_start
 
 
 def heaviest_first(work: np.ndarray, columns: int) -> np.ndarray:

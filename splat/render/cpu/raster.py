@@ -90,7 +90,7 @@ class CpuRaster:
 
     def number_accumulators(self) -> tuple[tile.Lists, np.ndarray]:
         """The intersections that some pixel reaches, and (n + 1,) the first accumulator of each splat."""
-        return binning.reached_lists(self.lists, self.pixels.reached, len(self.splats), self.frame.columns)
+        return binning.reached_lists(self.lists, self.pixels.reached, len(self.splats))
 
     def _tiles(self, planes: np.ndarray) -> np.ndarray:
         """Planes as (planes, rows of tiles, TILE_HEIGHT, tiles in a row, pixels in a row of a tile)."""
