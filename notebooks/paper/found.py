@@ -146,8 +146,8 @@ def lines(rows: pd.DataFrame, answered: pd.DataFrame, switched: pd.DataFrame, fo
         f"StableGS's attribute probes change {changes(PROBES)}",
         f"Dropping a fifth of the Gaussians in each step changes {changes(DROPPED)}",
         f"Whole StableGS gains {_interval(gain)} on fern, in the paper {gain.claimed}; probing a viewpoint for each view it "
-        f"took {_interval(time)} the processor time, in the paper {time.claimed}; over DropGaussian it is {_interval(over)}, in the "
-        f"paper {over.claimed}.",
+        f"took {_interval(time)} the processor time, in the paper {time.claimed}; over DropGaussian it is {_interval(over)}, "
+        f"in the paper {over.claimed}.",
         f"Of the paper's ten statements, on fern: {'; '.join(f'{verdict}: {count}' for verdict, count in verdicts.items())}.",
     ))  # fmt: skip
 
