@@ -15,7 +15,9 @@ def use_and_free() -> None:
         array[::PAGE] = 1
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep freed memory by rules of their own")
+@pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc", reason="other C libraries keep freed memory by rules of their own"
+)
 def test_what_a_step_frees_the_next_one_has_without_asking_for_pages():
     use_and_free()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
