@@ -10,7 +10,7 @@ PAGE, SIZE, ARRAYS, STEPS = resource.getpagesize(), 5_000_000, 8, 5
 
 
 def use_and_free() -> None:
-    arrays = [aligned((SIZE,), np.uint8) for _ in range(ARRAYS)]
+    arrays = [aligned((SIZE,), np.dtype(np.uint8)) for _ in range(ARRAYS)]
     for array in arrays:
         array[::PAGE] = 1
 
