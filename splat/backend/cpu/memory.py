@@ -34,6 +34,7 @@ from splat.backend.cpu.simd import (
     VectorType,
     address_of,
     call,
+    exchanged,
     intrinsic,
     lanes,
     load_at,
@@ -84,12 +85,8 @@ def _transposed(builder, rows):
     L, rows = len(rows), list(rows)
     step = 1
     while step < L:
-        low = [lane if not lane & step else L + lane - step for lane in range(L)]
-        high = [lane + step if not lane & step else L + lane for lane in range(L)]
-        masks = [ir.Constant(ir.VectorType(I32, L), places) for places in (low, high)]
         for r in (r for r in range(L) if not r & step):
-            pair = rows[r], rows[r | step]
-            rows[r], rows[r | step] = (builder.shuffle_vector(*pair, mask) for mask in masks)
+            rows[r], rows[r | step] = exchanged(builder, rows[r], rows[r | step], step)
         step *= 2
     return rows
 

@@ -345,26 +345,34 @@ def store_sums(typing, array, index, vectors):
     return types.void(array, index, vectors), generate
 
 
+def shuffled(builder, x, y, places):
+    """The lanes of x and then y at these places."""
+    return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(I32, len(places)), places))
+
+
+def exchanged(builder, x, y, step):
+    """x and y, the lanes of x whose number has the bit `step` exchanged for those of y whose number has not."""
+    n = x.type.count
+    low = [lane if not lane & step else n + lane - step for lane in range(n)]
+    high = [lane + step if not lane & step else n + lane for lane in range(n)]
+    return shuffled(builder, x, y, low), shuffled(builder, x, y, high)
+
+
 def _sums_of(builder, values):
     """The sum over the lanes of each vector, as one vector; as many vectors as a power of two, at most one a lane.
 
     Two vectors become one, whose lanes hold sums of half of the lanes of either: a transposition that adds.
     """
 
-    def shuffle(x, y, lanes):
-        return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
-
     n, places = values[0].type.count, [0]
     for step in (n >> k for k in range(1, n.bit_length())):
-        low = [lane if not lane & step else n + lane - step for lane in range(n)]
-        high = [lane + step if not lane & step else n + lane for lane in range(n)]
         if len(values) > 1:
             pairs = zip(values[::2], values[1::2], strict=True)
-            values = [builder.fadd(shuffle(x, y, low), shuffle(x, y, high)) for x, y in pairs]
+            values = [builder.fadd(*exchanged(builder, x, y, step)) for x, y in pairs]
             places += [place + step for place in places]
         else:
-            values = [builder.fadd(values[0], shuffle(*values, *values, [lane ^ step for lane in range(n)]))]
-    return shuffle(values[0], values[0], places)
+            values = [builder.fadd(values[0], shuffled(builder, *values, *values, [lane ^ step for lane in range(n)]))]
+    return shuffled(builder, *values, *values, places)
 
 
 # --- functions of vectors ---------------------------------------------------------------------------------------------
