@@ -363,7 +363,6 @@ def _sums_of(builder, values):
 
     Two vectors become one, whose lanes hold sums of half of the lanes of either: a transposition that adds.
     """
-
     n, places = values[0].type.count, [0]
     for step in (n >> k for k in range(1, n.bit_length())):
         if len(values) > 1:
@@ -371,8 +370,9 @@ def _sums_of(builder, values):
             values = [builder.fadd(*exchanged(builder, x, y, step)) for x, y in pairs]
             places += [place + step for place in places]
         else:
-            values = [builder.fadd(values[0], shuffled(builder, *values, *values, [lane ^ step for lane in range(n)]))]
-    return shuffled(builder, *values, *values, places)
+            swapped = shuffled(builder, values[0], values[0], [lane ^ step for lane in range(n)])
+            values = [builder.fadd(values[0], swapped)]
+    return shuffled(builder, values[0], values[0], places)
 
 
 # --- functions of vectors ---------------------------------------------------------------------------------------------
