@@ -61,7 +61,7 @@ def of_checks(checks: Mapping[str, Check]) -> list[Line]:
     """Lines on self-checks that failed or could not run."""
     lines = []
     for name, check in checks.items():
-        label, note = name.replace("_", " "), _in_brackets(check.note)
+        label, note = name.replace("_", " "), f" ({check.note})" if check.note else ""
         if check.passed is None:
             lines.append(Line(f"The check of {label} could not run{note}.", "caution"))
         elif not check.passed:
@@ -264,14 +264,11 @@ def _errors_of_interpolation(plane: schema.Slice) -> str:
 
 def unresolved(plane: schema.Slice, made: Provenance) -> str:
     """Why a plane is not drawn, and the command that resolves it."""
+    to_what = f" to {_percent(plane.tolerance)} of the range of the loss" if plane.tolerance else ""
     return (
-        f"Between its two sections the plane is not known{_to_tolerance(plane)} from {plane.evaluated_points:,} of "
+        f"Between its two sections the plane is not known{to_what} from {plane.evaluated_points:,} of "
         f"{plane.points:,} renders, and no surface is drawn; {made.other_command('slice')} renders more."
     )
-
-
-def _to_tolerance(plane: schema.Slice) -> str:
-    return f" to {_percent(plane.tolerance)} of the range of the loss" if plane.tolerance else ""
 
 
 def _sentence(note: str) -> str:
@@ -294,7 +291,3 @@ def _bracket(index: schema.Index) -> str:
 
 def _percent(share: float) -> str:
     return f"{rough(100 * share)}%"
-
-
-def _in_brackets(note: schema.Maybe[str]) -> str:
-    return f" ({note})" if note else ""

@@ -28,7 +28,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
 
-import pandas as pd
 import torch
 from rich.console import Console
 
@@ -116,6 +115,8 @@ class Run:
         save_checkpoint(self.out / CHECKPOINT, self.training, self.reference)
         spent.write(self.out)
         if history := self.training.method.history:
+            import pandas as pd  # slow to import
+
             write_atomically(self.out / HISTORY, pd.DataFrame(history).to_csv(index=False).encode())
         if self.keep != "all":
             folders = (path.parent.name for path in self.out.glob(f"{KEPT.format('*')}/{CHECKPOINT}"))

@@ -34,7 +34,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 
 from analysis.records.run_files import RECORDS, read_trajectory
@@ -127,6 +126,8 @@ class Trajectory:
         row["seconds"] = perf_counter() - start
         row |= self._about()
         self.rows.append(row)
+        import pandas as pd  # slow to import
+
         # dtype object keeps integers in a column with gaps, as they are in rows that were read
         table = pd.DataFrame(self.rows, columns=COLUMNS, dtype=object)
         write_atomically(self.run / RECORDS, table.to_csv(index=False).encode())

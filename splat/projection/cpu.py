@@ -6,6 +6,8 @@ Values are computed in double precision, so that needles (condition number to 1e
 The formulas run on vectors, a Gaussian in each lane; a `block` holds their numbers (`backend/cpu/memory.py`), in rows MEAN, ...
 """
 
+from math import sqrt
+
 import numpy as np
 
 from splat.backend.cpu.dual import exp, select
@@ -43,6 +45,8 @@ def width_array(gaussians: Gaussians, lens: Lens) -> np.ndarray | None:
     widths = widths_of(gaussians, lens)
     return None if widths is None else widths.numpy()
 
+
+TINY = float(np.finfo(np.float64).tiny)
 
 # Rows of a block: each has room to a multiple of 8.  SEEN: 1 or 0; BAR, WEIGHT: adjoints of the splat and the harmonics.
 MEAN, LOG_SCALES, QUAT, LOGIT, WIDTH, SEEN, SPLAT_AT, BAR = 0, 8, 16, 24, 25, 26, 32, 48
@@ -206,6 +210,19 @@ def clamped_bar(block, moves):
         select((colours[1] > 0.0) & moves, bars[1], 0.0),
         select((colours[2] > 0.0) & moves, bars[2], 0.0),
     )
+
+
+@kernel
+def add_screen_gradients(start, stop, means, conics, drawn, gradient, half_width, half_height, total, renders):
+    """`projection.reference.add_screen_gradients`."""
+    for i in range(start, stop):
+        a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
+        det = max(a * c - b * b, TINY)
+        x, y = abs(means[i, 0] - half_width), abs(means[i, 1] - half_height)
+        if drawn[i] and x < half_width + 3 * sqrt(c / det) and y < half_height + 3 * sqrt(a / det):
+            across, down = gradient[i, 0] * half_width, gradient[i, 1] * half_height
+            total[i] += sqrt(across * across + down * down)
+            renders[i] += 1
 
 
 def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

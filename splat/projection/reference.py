@@ -117,6 +117,21 @@ def on_screen(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:
     return splats.drawn & inside[..., 0] & inside[..., 1]
 
 
+@torch.no_grad()
+def add_screen_gradients(
+    total: Float[Tensor, " n"],
+    renders: Float[Tensor, " n"],
+    gradient: Float[Tensor, "n 2"],
+    splats: Splats,
+    camera: Camera,
+) -> None:
+    """Add what one render gives to `splat.training.densify.ScreenGradients`; gradient: in the splats' means, per px."""
+    half_size = torch.tensor([camera.width / 2, camera.height / 2]).to(gradient, non_blocking=True)
+    visible = on_screen(splats, camera)
+    total += torch.where(visible, (gradient * half_size).norm(dim=1), 0)
+    renders += visible
+
+
 def condition(conics: Float[Tensor, "n 3"]) -> Float64[Tensor, " n"]:
     """The condition number of every splat's covariance, which is that of its conic, with the blur in it.
 

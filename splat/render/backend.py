@@ -25,12 +25,14 @@ from splat.backend.cpu.threads import over_range
 from splat.losses.cpu.loss import NUMPY, CpuImageLoss, CpuViewLoss
 from splat.losses.protocols import ImageLoss, ViewLoss
 from splat.losses.reference import LossSettings
+from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection import cpu
 from splat.projection.formulas import Lens
 from splat.projection.linear_cpu import CpuProjection
 from splat.projection.protocols import Projection
+from splat.projection.reference import Splats
 from splat.projection.whitening import COEFFICIENTS, MOMENTS, PLAIN_GRADIENT, PLAIN_TANGENT
 from splat.render.cpu.raster import CpuRaster
 
@@ -180,6 +182,12 @@ class Backend(Protocol):
         """The projection, linearised for the Gaussians at index; moments: the adjoint of the splats."""
         ...
 
+    def add_screen_gradients(
+        self, total: Tensor, renders: Tensor, gradient: Float[Tensor, "n 2"], splats: Splats, camera: Camera
+    ) -> None:
+        """`projection.reference.add_screen_gradients`, in place."""
+        ...
+
     def convert(
         self, way: int, splats: Float64[Tensor, "n 9"], numbers: Float[Tensor, "n 9"]
     ) -> Float64[Tensor, "n 9"]:
@@ -218,6 +226,7 @@ class CpuBackend:
     """`Backend` by Numba kernels on NumPy views of tensors."""
 
     exact_blocks = True
+    linearize_projection, rasterize, adam = CpuProjection, CpuRaster, staticmethod(adam_step)
 
     def project(self, gaussians, lens):
         splats, depths, drawn = cpu.project_arrays(gaussians, lens)
@@ -231,25 +240,21 @@ class CpuBackend:
         over_range(len(gaussians), cpu.project_adjoint, lens, *arguments)
         return gradient
 
-    def linearize_projection(self, gaussians, lens, splats, moments, index) -> Projection:
-        return CpuProjection(gaussians, lens, splats, moments, index)
+    def add_screen_gradients(self, total, renders, gradient, splats, camera):
+        arrays = (each.numpy() for each in (splats.means, splats.conics, splats.drawn, gradient))
+        halves = camera.width / 2, camera.height / 2
+        over_range(len(total), cpu.add_screen_gradients, *arrays, *halves, total.numpy(), renders.numpy())
 
     def convert(self, way, splats, numbers):
         out = np.empty(splats.shape)
         over_range(len(splats), cpu.convert, way, splats.numpy(), numbers.numpy(), out)
         return torch.from_numpy(out)
 
-    def rasterize(self, splats, depths, drawn, background, width, height, settings) -> Raster:
-        return CpuRaster(splats, depths, drawn, background, width, height, settings)
-
     def view_loss(self, target, settings, like) -> ViewLoss:
         return CpuViewLoss(target, settings, like.dtype)
 
     def image_loss(self, image, settings) -> ImageLoss:
         return CpuImageLoss(image.shape, settings, NUMPY[image.dtype])
-
-    def adam(self, parameters, gradient, rates, first, second, updates):
-        adam_step(parameters, gradient, rates, first, second, updates)
 
 
 CPU = CpuBackend()

@@ -1,5 +1,7 @@
 """Project and composite a view without derivatives, and find the Gaussians that touch it."""
 
+from math import isfinite
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -36,7 +38,7 @@ def background_of(gaussians: Gaussians, colour: Float[Tensor, "3"] | None) -> Fl
     """
     if colour is None:
         return gaussians.flat.new_zeros(3)
-    if colour.shape != (3,) or not colour.isfinite().all():
+    if colour.shape != (3,) or not all(map(isfinite, colour.tolist())):
         raise InputError(f"expected a background of three finite numbers, red, green and blue, got {colour.tolist()}")
     return colour.to(gaussians.flat, non_blocking=True)
 

@@ -34,7 +34,8 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.typed import Count, Length, Positive, Settings, Share
 from splat.projection.antialias import filter_factor
-from splat.projection.reference import Splats, on_screen, rotation_matrices
+from splat.projection.reference import Splats, rotation_matrices
+from splat.render.backend import backend_of
 
 SPLIT_INTO = 2  # Gaussians
 SPLIT_SHRINK = 0.8 * SPLIT_INTO  # divisor of scales
@@ -118,14 +119,9 @@ class ScreenGradients:
     def zero(cls, n: int, dtype: torch.dtype, device: torch.device | None = None) -> "ScreenGradients":
         return cls(*(torch.zeros(n, dtype=dtype, device=device) for _ in range(2)))
 
-    @torch.no_grad()
     def add(self, gradient: Float[Tensor, "n 2"], splats: Splats, camera: Camera) -> None:
         """Add dL / d(splats.means) of one render, per pixel."""
-        half_size = torch.tensor([camera.width / 2, camera.height / 2], dtype=gradient.dtype)
-        half_size = half_size.to(gradient.device, non_blocking=True)
-        visible = on_screen(splats, camera)
-        self.total += torch.where(visible, (gradient * half_size).norm(dim=1), 0)
-        self.renders += visible
+        backend_of(self.total).add_screen_gradients(self.total, self.renders, gradient, splats, camera)
 
     @property
     def mean(self) -> Float[Tensor, " n"]:

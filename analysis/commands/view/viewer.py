@@ -199,10 +199,8 @@ class Viewer:
         return self.objective.active.with_flat(flat)
 
     def _image(self, gaussians: Gaussians) -> np.ndarray:
-        return bytes_of(rendered(self.objective, self._place(), gaussians))
-
-    def _place(self) -> int:
-        return [view.name for view in self.objective.views].index(self.view.value)
+        place = [view.name for view in self.objective.views].index(self.view.value)
+        return bytes_of(rendered(self.objective, place, gaussians))
 
     def click(self, origin: Any, direction: Any) -> None:
         """Pick the splat at a ray, in viser's coordinates."""

@@ -50,14 +50,16 @@ def adam_step(
     parameters: Float[Tensor, " p"],
     gradient: Float[Tensor, " p"],
     rates: Float[Tensor, " p"],
-    m: Float[Tensor, " p"],
-    v: Float[Tensor, " p"],
+    first: Float[Tensor, " p"],
+    second: Float[Tensor, " p"],
     updates: int,
 ) -> None:
     """Step number `updates`, in place."""
-    arrays = [array.detach().numpy() for array in (parameters, gradient.contiguous(), rates.contiguous(), m, v)]
-    numbers = (1 - BETA1, grid_of(m.dtype), BETA2, 1 - BETA2, *bias_corrections(updates), EPS)
-    size, L = len(m), lanes_of(arrays[0].dtype)
+    arrays = [
+        array.detach().numpy() for array in (parameters, gradient.contiguous(), rates.contiguous(), first, second)
+    ]
+    numbers = (1 - BETA1, grid_of(first.dtype), BETA2, 1 - BETA2, *bias_corrections(updates), EPS)
+    size, L = len(first), lanes_of(arrays[0].dtype)
     over_range(size // L, update, *arrays, numbers)
     if rest := size % L:  # the last numbers, in vectors of their own
         ends = np.zeros((len(arrays), L), arrays[0].dtype)

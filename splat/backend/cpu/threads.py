@@ -54,8 +54,7 @@ def _run(calls: list[tuple]) -> None:
 def over_range(size: int, kernel: Callable, *arguments) -> None:
     """kernel(start, stop, *arguments) over contiguous parts of range(size)."""
     parts = min(thread_count(), max(size, 1))
-    edges = [size * t // parts for t in range(parts + 1)]
-    _run([(kernel, edges[t], edges[t + 1], *arguments) for t in range(parts)])
+    _run([(kernel, size * t // parts, size * (t + 1) // parts, *arguments) for t in range(parts)])
 
 
 def over_batch(size: int, kernel: Callable[[int, int], None], device: torch.device) -> None:

@@ -79,7 +79,8 @@ def information(
     blocks = _squares(gaussians, camera, background, settings)
     values, vectors = torch.linalg.eigh(on_complement(blocks.geometry.double(), quats))
     geometry = (vectors * values.clamp_min(0)[:, None]) @ vectors.mT
-    grey = _squares(channel_sum(gaussians), camera, _red(background.sum()), settings)
+    red = background.sum() * background.new_tensor([1.0, 0.0, 0.0])
+    grey = _squares(channel_sum(gaussians), camera, red, settings)
     own, sh = grey.geometry.double().diagonal(dim1=1, dim2=2)[:, UNTURNED], blocks.sh.double()
     return Information(geometry, sh, torch.cat([own.clamp_min(0), sh.flatten(1)], dim=1))
 
@@ -134,10 +135,6 @@ def channel_sum(gaussians: Gaussians) -> Gaussians:
     sh[:, :, 0] = gaussians.sh.sum(dim=2)
     sh[:, 0] += torch.tensor([1.0, -0.5, -0.5]).to(sh) / Y00  # a channel is 1/2 + Y00 times its first coefficient
     return Gaussians.pack(gaussians.attributes | {"sh": sh}).with_filter(gaussians.filter_widths)
-
-
-def _red(value: Float[Tensor, ""]) -> Float[Tensor, "3"]:
-    return torch.stack([value, 0 * value, 0 * value])
 
 
 def _squares(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splat.model.gaussians import ATTRIBUTES, Gaussians
-from splat.projection.reference import Splats, on_screen
+from splat.projection.reference import Splats, add_screen_gradients, on_screen
 from splat.render.render import render
 from splat.training.densify import DensifySettings, ScreenGradients, densify, reset_opacities
 from tests.refusals import refused
@@ -150,6 +150,23 @@ def test_screen_gradients_are_mean_ndc_norms_over_renders_that_show_it():
     half_w, half_h = WIDTH / 2, HEIGHT / 2
     expected = torch.tensor([(3 * half_w + half_h) / 2, (half_w**2 + half_h**2) ** 0.5, 0.0])
     torch.testing.assert_close(gradients.mean, expected)
+
+
+def test_the_kernel_adds_what_the_reference_adds():
+    camera, g = tiny_views()[0].camera, generator()
+    means = torch.rand(400, 2, generator=g).double() * torch.tensor([3 * WIDTH, 3 * HEIGHT]) - torch.tensor(
+        [WIDTH, HEIGHT]
+    )
+    a, b, c = (torch.rand(3, 400, generator=g).double() * 0.3).unbind()
+    conics, gradient = torch.stack([a, b, c], dim=1), torch.randn(400, 2, generator=g).double()  # half have no ellipse
+    drawn = torch.arange(400) % 5 > 0
+    splats = Splats(means, conics, a, torch.rand(400, 3), torch.ones(400), drawn)
+    found, expected = (ScreenGradients.zero(400, torch.float32) for _ in range(2))
+    found.add(gradient, splats, camera)
+    add_screen_gradients(expected.total, expected.renders, gradient, splats, camera)
+    assert 100 < expected.renders.sum() < 300 and bool((a * c < b * b)[expected.renders > 0].any())
+    assert torch.equal(found.renders, expected.renders)
+    torch.testing.assert_close(found.total, expected.total)
 
 
 def steps(iterations: int, what: str, **how: bool) -> list[int]:
