@@ -111,21 +111,17 @@ def on_screen(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:
     """Mask of the Gaussians that are drawn and have a 3-sigma bounding box that meets the image."""
     a, b, c = splats.conics.unbind(-1)
     det = (a * c - b * b).clamp_min(torch.finfo(a.dtype).tiny)  # cancels for needles: the box is then too large
-    reach = 3 * torch.stack([c / det, a / det], dim=-1).sqrt()
-    size = torch.tensor([camera.width, camera.height]).to(reach, non_blocking=True)
-    inside = (splats.means + reach > 0) & (splats.means - reach < size)
-    return splats.drawn & inside[..., 0] & inside[..., 1]
+    inside = splats.drawn
+    for centre, spread, half in zip(
+        splats.means.unbind(-1), (c, a), (camera.width / 2, camera.height / 2), strict=True
+    ):
+        inside = inside & ((centre - half).abs() < 3 * (spread / det).sqrt() + half)
+    return inside
 
 
 @torch.no_grad()
-def add_screen_gradients(
-    total: Float[Tensor, " n"],
-    renders: Float[Tensor, " n"],
-    gradient: Float[Tensor, "n 2"],
-    splats: Splats,
-    camera: Camera,
-) -> None:
-    """Add what one render gives to `splat.training.densify.ScreenGradients`; gradient: in the splats' means, per px."""
+def add_screen_gradients(total: Tensor, renders: Tensor, gradient: Tensor, splats: Splats, camera: Camera) -> None:
+    """Add what one render gives to `training.densify.ScreenGradients`; gradient: (n, 2), in the splats' means, per px."""
     half_size = torch.tensor([camera.width / 2, camera.height / 2]).to(gradient, non_blocking=True)
     visible = on_screen(splats, camera)
     total += torch.where(visible, (gradient * half_size).norm(dim=1), 0)
@@ -139,7 +135,7 @@ def condition(conics: Float[Tensor, "n 3"]) -> Float64[Tensor, " n"]:
     [4.0, 1.0]
     """
     a, b, c = conics.double().unbind(-1)
-    largest = (a + c) / 2 + torch.hypot((a - c) / 2, b)
+    largest = (a + c) / 2 + ((a - c).square() / 4 + b * b).sqrt()
     kappa = largest.square() / (a * c - b * b)
     return kappa.nan_to_num(nan=torch.inf).abs()  # edge on and infinitely thin
 

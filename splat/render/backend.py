@@ -183,7 +183,7 @@ class Backend(Protocol):
         ...
 
     def add_screen_gradients(
-        self, total: Tensor, renders: Tensor, gradient: Float[Tensor, "n 2"], splats: Splats, camera: Camera
+        self, total: Tensor, renders: Tensor, gradient: Tensor, splats: Splats, camera: Camera
     ) -> None:
         """`projection.reference.add_screen_gradients`, in place."""
         ...
