@@ -159,7 +159,7 @@ def project_adjoint(
     start, stop, lens, means, log_scales, quats, logits, sh, widths, splats, drawn, bar,
     d_means, d_log_scales, d_quats, d_logits, d_sh,
 ):  # fmt: skip
-    """The adjoints of the stored parameters, given that of the splats, bar (n, 9); outputs start at 0."""
+    """The adjoints of the stored parameters, given that of the splats, bar (n, 9)."""
     bands, block = sh.shape[1], scratch(np.empty(0), ROWS * lanes(np.empty(0)))
     L = lanes(block)
     for i in range(start, stop, L):
@@ -193,11 +193,14 @@ def project_adjoint(
             store_where(moves, block, MEAN, plus(m, along))
             store_where(moves, block, LOG_SCALES, s)
             store_where(moves, block, QUAT, q)
-            scatter(block, MEAN, d_means, 3, i, stop)
-            scatter(block, LOG_SCALES, d_log_scales, 3, i, stop)
-            scatter(block, QUAT, d_quats, 4, i, stop)
-            scatter_one(block, LOGIT, d_logits, i, stop)
-            scatter(block, SH_AT, d_sh, 3 * bands, i, stop)
+        else:
+            for row in range(ROWS):
+                store(block, row * L, broadcast(block, 0.0))
+        scatter(block, MEAN, d_means, 3, i, stop)
+        scatter(block, LOG_SCALES, d_log_scales, 3, i, stop)
+        scatter(block, QUAT, d_quats, 4, i, stop)
+        scatter_one(block, LOGIT, d_logits, i, stop)
+        scatter(block, SH_AT, d_sh, 3 * bands, i, stop)
 
 
 @formula

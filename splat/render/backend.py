@@ -233,7 +233,7 @@ class CpuBackend:
         return torch.from_numpy(splats), torch.from_numpy(depths), torch.from_numpy(drawn)
 
     def project_vjp(self, gaussians, lens, splats, drawn, bar):
-        gradient = torch.zeros_like(gaussians.flat)
+        gradient = torch.empty_like(gaussians.flat)
         inputs = (*cpu.attribute_arrays(gaussians), cpu.width_array(gaussians, lens))
         outputs = cpu.attribute_arrays(gaussians.with_flat(gradient))
         arguments = (*inputs, splats.numpy(), drawn.numpy(), bar.numpy(), *outputs)

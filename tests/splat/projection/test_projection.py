@@ -156,12 +156,14 @@ def test_the_adjoint_is_the_gradient_of_the_specification(degree, mode, dtype):
     gaussians = gaussians.to(dtype)
     lens = lens_of(camera, settings_of(mode))
     splats, _, drawn = project_arrays(gaussians, lens)
-    gradient = gaussians.with_flat(torch.zeros_like(gaussians.flat))
+    gradient, unmoved = (gaussians.with_flat(torch.full_like(gaussians.flat, torch.nan)) for _ in range(2))
     inputs = (*attribute_arrays(gaussians), width_array(gaussians, lens))
     bar = truth(degree, mode).bar.to(dtype).numpy()
     over_range(N, project_adjoint, lens, *inputs, splats, drawn, bar, *attribute_arrays(gradient))
     errors = errors_by_block(gradient.flat, truth(degree, mode).gradient, gaussians.blocks)
     assert max(errors.values()) < DERIVATIVE[dtype], errors
+    over_range(N, project_adjoint, lens, *inputs, splats, drawn, 0 * bar, *attribute_arrays(unmoved))
+    assert not unmoved.flat.any()
 
 
 def linearized(degree: int, dtype: torch.dtype, mode: Antialias = "none") -> tuple[CpuProjection, Gaussians, Tensor]:
