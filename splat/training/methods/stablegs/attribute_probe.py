@@ -239,7 +239,8 @@ def depth_biased(gradient: Float[Tensor, "n 3"], rays: Float64[Tensor, "n 3"], g
 
 
 def _unit(x: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3"]:
-    return x / x.norm(dim=1, keepdim=True).clamp_min(torch.finfo(x.dtype).tiny)
+    """x / |x|, and less where |x|^2 would underflow."""
+    return x / x.norm(dim=1, keepdim=True).clamp_min(torch.finfo(x.dtype).tiny ** 0.5)
 
 
 def exponential(omega: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:

@@ -148,6 +148,9 @@ def test_gradients_of_any_size_give_probes_of_length_rho():
         step = step_of(probe(single, (gradient * size).float()), single).means[5:]
         # means of up to 16 in single precision: 1e-6 in each coordinate
         assert torch.allclose(step.norm(dim=1), torch.tensor(RHO["means"]), rtol=0, atol=2e-6)
+    for size in (1e-160, 1e-170, 1e-300):  # whose squares underflow in double precision
+        step = step_of(probe(gaussians, gradient * size), gaussians).means
+        assert (step.norm(dim=1) < RHO["means"] + ROUND_OFF).all()
 
 
 def test_quaternions_turn_by_the_exponential_map_of_rotations():
