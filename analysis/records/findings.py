@@ -264,9 +264,9 @@ def _errors_of_interpolation(plane: schema.Slice) -> str:
 
 def unresolved(plane: schema.Slice, made: Provenance) -> str:
     """Why a plane is not drawn, and the command that resolves it."""
-    to_what = f" to {_percent(plane.tolerance)} of the range of the loss" if plane.tolerance else ""
+    accuracy = f" to {_percent(plane.tolerance)} of the range of the loss" if plane.tolerance else ""
     return (
-        f"Between its two sections the plane is not known{to_what} from {plane.evaluated_points:,} of "
+        f"Between its two sections the plane is not known{accuracy} from {plane.evaluated_points:,} of "
         f"{plane.points:,} renders, and no surface is drawn; {made.other_command('slice')} renders more."
     )
 

@@ -117,6 +117,8 @@ class Trajectory:
 
     def _record(self) -> None:
         """Add a row and write all."""
+        import pandas as pd  # slow to import
+
         start = perf_counter()
         row: Row = {"step": self.training.step, "gaussians": len(self.training.gaussians), "state": "skipped"}
         try:
@@ -126,8 +128,6 @@ class Trajectory:
         row["seconds"] = perf_counter() - start
         row |= self._about()
         self.rows.append(row)
-        import pandas as pd  # slow to import
-
         # dtype object keeps integers in a column with gaps, as they are in rows that were read
         table = pd.DataFrame(self.rows, columns=COLUMNS, dtype=object)
         write_atomically(self.run / RECORDS, table.to_csv(index=False).encode())

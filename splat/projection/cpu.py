@@ -47,7 +47,6 @@ def width_array(gaussians: Gaussians, lens: Lens) -> np.ndarray | None:
 
 
 TINY = float(np.finfo(np.float64).tiny)
-
 # Rows of a block: each has room to a multiple of 8.  SEEN: 1 or 0; BAR, WEIGHT: adjoints of the splat and the harmonics.
 MEAN, LOG_SCALES, QUAT, LOGIT, WIDTH, SEEN, SPLAT_AT, BAR = 0, 8, 16, 24, 25, 26, 32, 48
 HARMONICS, WEIGHT, SH_AT, ROWS = 64, 80, 96, 144
@@ -193,7 +192,7 @@ def project_adjoint(
             store_where(moves, block, MEAN, plus(m, along))
             store_where(moves, block, LOG_SCALES, s)
             store_where(moves, block, QUAT, q)
-        else:
+        else:  # zeros
             for row in range(ROWS):
                 store(block, row * L, broadcast(block, 0.0))
         scatter(block, MEAN, d_means, 3, i, stop)

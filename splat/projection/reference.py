@@ -111,10 +111,8 @@ def on_screen(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:
     """Mask of the Gaussians that are drawn and have a 3-sigma bounding box that meets the image."""
     a, b, c = splats.conics.unbind(-1)
     det = (a * c - b * b).clamp_min(torch.finfo(a.dtype).tiny)  # cancels for needles: the box is then too large
-    inside = splats.drawn
-    for centre, spread, half in zip(
-        splats.means.unbind(-1), (c, a), (camera.width / 2, camera.height / 2), strict=True
-    ):
+    (x, y), inside = splats.means.unbind(-1), splats.drawn
+    for centre, spread, half in ((x, c, camera.width / 2), (y, a, camera.height / 2)):
         inside = inside & ((centre - half).abs() < 3 * (spread / det).sqrt() + half)
     return inside
 

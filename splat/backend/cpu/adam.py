@@ -55,9 +55,7 @@ def adam_step(
     updates: int,
 ) -> None:
     """Step number `updates`, in place."""
-    arrays = [
-        array.detach().numpy() for array in (parameters, gradient.contiguous(), rates.contiguous(), first, second)
-    ]
+    arrays = [each.detach().numpy() for each in (parameters, gradient.contiguous(), rates.contiguous(), first, second)]
     numbers = (1 - BETA1, grid_of(first.dtype), BETA2, 1 - BETA2, *bias_corrections(updates), EPS)
     size, L = len(first), lanes_of(arrays[0].dtype)
     over_range(size // L, update, *arrays, numbers)

@@ -79,7 +79,7 @@ def _read(path: Path, content: bytes) -> SplatFile:
     if content.startswith(LICHTFELD):
         raise InputError("it is LichtFeld's own format, which changes often: export a PLY there")
     if content.startswith(MAGIC):
-        compressed = any(element.name == "chunk" for element in read_header(content).elements)
+        compressed = quantised.is_compressed(read_header(content))
         return quantised.read_compressed_ply(content) if compressed else read_splat_ply(content)
     if content.startswith((quantised.GZIP_MAGIC, quantised.SPZ_MAGIC)):
         return quantised.read_spz(content)

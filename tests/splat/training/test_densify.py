@@ -153,10 +153,8 @@ def test_screen_gradients_are_mean_ndc_norms_over_renders_that_show_it():
 
 
 def test_the_kernel_adds_what_the_reference_adds():
-    camera, g = tiny_views()[0].camera, generator()
-    means = torch.rand(400, 2, generator=g).double() * torch.tensor([3 * WIDTH, 3 * HEIGHT]) - torch.tensor(
-        [WIDTH, HEIGHT]
-    )
+    camera, g, size = tiny_views()[0].camera, generator(), torch.tensor([WIDTH, HEIGHT])
+    means = torch.rand(400, 2, generator=g).double() * 3 * size - size
     a, b, c = (torch.rand(3, 400, generator=g).double() * 0.3).unbind()
     conics, gradient = torch.stack([a, b, c], dim=1), torch.randn(400, 2, generator=g).double()  # half have no ellipse
     drawn = torch.arange(400) % 5 > 0
