@@ -19,8 +19,8 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any, Literal, NamedTuple
 
+import scipy
 from jaxtyping import Float64
-from scipy.special import stdtrit
 from torch import Tensor
 
 StopReason = Literal["tolerance", "noise floor", "matvec budget", "evaluation budget", "exact", "not asked for"]
@@ -87,7 +87,7 @@ def t_quantile(freedom: float, confidence: float) -> float:
     >>> round(t_quantile(9, 0.95), 3)
     2.262
     """
-    return float(stdtrit(freedom, (1 + confidence) / 2))
+    return float(scipy.special.stdtrit(freedom, (1 + confidence) / 2))
 
 
 def standard_deviation(samples: Float64[Tensor, "s *shape"]) -> Float64[Tensor, "*shape"]:

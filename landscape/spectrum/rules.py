@@ -25,9 +25,9 @@ from dataclasses import dataclass, field
 from math import hypot, isfinite, sqrt
 from statistics import NormalDist
 
+import scipy
 import torch
 from jaxtyping import Bool, Float64
-from scipy.special import chdtri
 from torch import Tensor
 
 from landscape.results import Bracket, standard_deviation, t_quantile
@@ -134,7 +134,7 @@ class SpectralDensity:
         # signs see less: the share of the variance that the samples themselves show, at most
         if count > 1:
             own = (float(standard_deviation(samples)) / unit) ** 2 / count
-            seen = min(own / variance * (count - 1) / float(chdtri(count - 1, confidence)), 1.0)
+            seen = min(own / variance * (count - 1) / float(scipy.special.chdtri(count - 1, confidence)), 1.0)
         middle = seen * (q * q + 2) * b / 3
         half = q * sqrt(seen * max(variance + (4 - q * q) * b * b / 3, 0.0))
         return hypot(unit * (half - middle), other), hypot(unit * (half + middle), other)

@@ -204,14 +204,15 @@ class Gaussians(ShortRepr):
                 self._refuse(*condition)
 
     def _is_moderate(self, largest: float) -> bool:
-        """Whether no number is beyond `largest`, no quaternion below its inverse and no filter below 0."""
-        ends = [*torch.aminmax(self.flat.detach()), self.quats.detach().abs().amax(dim=1).amin()]
+        """Whether, as squares tell, no number is beyond `largest`, no quaternion below its inverse and no filter below 0."""
+        flat, quats = self.flat.detach(), self.quats.detach()
+        ends = [torch.dot(flat, flat), (quats.square() @ quats.new_ones(4)).amin()]
         if self.filter_widths is not None:
             ends += torch.aminmax(self.filter_widths)
-        low, high, least, *widths = torch.stack(ends).cpu().tolist()  # waits for a GPU once
+        total, least, *widths = torch.stack(ends).cpu().tolist()  # waits for a GPU once
         narrow, wide = widths or (0.0, 0.0)
         # each is False of nan
-        return -largest <= low and high <= largest and least >= 1 / largest and narrow >= 0 and wide <= largest
+        return total <= largest**2 and least >= 4 / largest**2 and narrow >= 0 and wide <= largest
 
     def _refuse(self, good: Tensor, name: str, quality: str, meaning: str) -> None:
         first = int((~good).nonzero()[0])

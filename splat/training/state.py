@@ -272,6 +272,7 @@ class Training(ShortRepr):
     method: Method
     order: list[int] = field(default_factory=list)
     step: int = 0
+    _rates: tuple[tuple, Tensor] | None = field(default=None, init=False)  # the last of `rates`, and what they are of
 
     @classmethod
     def start(cls, gaussians: Gaussians, extent: float, config: TrainConfig) -> "Training":
@@ -320,9 +321,14 @@ class Training(ShortRepr):
         self.adam.update(self.gaussians.flat, gradient, self.rates(step))
 
     def rates(self, step: int) -> Float[Tensor, " p"]:
-        """The learning rate of every parameter at a step."""
-        position = position_rate(self.config.rates, self.extent, step, self.config.iterations)
-        return learning_rates(self.gaussians, self.config.rates, position)
+        """The learning rate of every parameter at a step, in a vector that the next call may write to."""
+        gaussians, rates = self.gaussians, self.config.rates
+        position = position_rate(rates, self.extent, step, self.config.iterations)
+        what = len(gaussians), gaussians.sh_degree, rates, gaussians.flat.device
+        if self._rates is None or self._rates[0] != what:
+            self._rates = what, learning_rates(gaussians, rates, position)
+        self._rates[1][gaussians.blocks["means"]] = position
+        return self._rates[1]
 
     def control_density(self, step: int, camera: Camera, base: LossAndGradient) -> None:
         """Collect the screen-space gradient of a render; clone, split, prune and reset opacities in the steps for it."""

@@ -26,6 +26,7 @@ from splat.losses.reference import REACH
 
 BORDER = 16  # numbers, at least REACH; whole cache lines
 RING = 16  # rows, at least WINDOW; a power of two
+TRIPLE = 3  # fields of a ring that lie together: a loss blurs three at a time
 
 
 class Frame(NamedTuple):
@@ -40,34 +41,36 @@ class Frame(NamedTuple):
 
 @formula
 def bordered_rows(like, fields, frame):
-    """Uninitialised bordered rows, side by side."""
-    return scratch(like, fields * (frame.stride + 2 * BORDER))
+    """Bordered rows of zeros, side by side."""
+    rows = scratch(like, fields * (frame.stride + 2 * BORDER))
+    rows[:] = 0
+    return rows
 
 
 @formula
 def ring_buffer(like, fields, frame):
-    return scratch(like, fields * RING * ring_pitch(frame))
+    return scratch(like, (fields + TRIPLE - 1) // TRIPLE * RING * TRIPLE * ring_pitch(frame))
 
 
 @formula
 def ring_pitch(frame):
-    """Numbers from a row of a ring to the next: an odd number of 16, so that its rows do not share sets of the cache."""
+    """Numbers of a field from a row to the next: an odd number of 16, so that rows do not share sets of the cache."""
     return ((frame.stride + 15) // 16 | 1) * 16
 
 
 @formula
-def ring_row(field, y, frame):
-    """The place of row y of a field in a ring."""
-    return (field * RING + (y & (RING - 1))) * ring_pitch(frame)
+def ring_at(ring, field, y, i, frame):
+    """The place of row y of a field in a ring, at the lanes at i: a row of three fields takes a vector of each in turn."""
+    row = field // TRIPLE * RING + (y & (RING - 1))
+    return TRIPLE * (row * ring_pitch(frame) + i) + field % TRIPLE * lanes(ring)
 
 
 @formula
 def clear(ring, first, fields, y, frame):
     """Row y of the fields of a ring from `first` on is 0, as a row outside of the image."""
     for field in range(first, first + fields):
-        at = ring_row(field, y, frame)
-        for i in range(frame.stride):
-            ring[at + i] = 0
+        for i in range(0, frame.stride, lanes(ring)):
+            store(ring, ring_at(ring, field, y, i, frame), 0.0)
 
 
 @formula
@@ -102,22 +105,21 @@ def leave_margin(rows, fields, margin, frame):
 
 @formula
 def begin_of(rows, field, frame):
-    """Index of the first number of a bordered row; what precedes and what follows its `width` numbers is set to 0."""
-    at = field * (frame.stride + 2 * BORDER)
-    for i in range(BORDER):
+    """Index of the first number of a bordered row; what follows its `width` numbers is set to 0."""
+    at = field * (frame.stride + 2 * BORDER) + BORDER
+    for i in range(frame.width, frame.stride):
         rows[at + i] = 0
-    for i in range(BORDER + frame.width, frame.stride + 2 * BORDER):
-        rows[at + i] = 0
-    return at + BORDER
+    return at
 
 
 @formula
 def blur_along(rows, fields, frame, ring, first, y):
     """The window along bordered rows, to row y of the fields of a ring from `first` on."""
     for field in range(fields):
-        begin, at = begin_of(rows, field, frame), ring_row(first + field, y, frame)
+        begin = begin_of(rows, field, frame)
         for i in range(0, frame.stride, lanes(rows)):
-            store(ring, at + i, weighted(load(rows, begin + i), both_ways(rows, begin + i)[0], frame.taps))
+            blurred = weighted(load(rows, begin + i), both_ways(rows, begin + i)[0], frame.taps)
+            store(ring, ring_at(ring, first + field, y, i, frame), blurred)
 
 
 @formula
@@ -137,7 +139,7 @@ def weighted(middle, pairs, taps):
 @formula
 def two_rows(ring, field, y, k, i, frame):
     """The sum of the rows k above and k below y of a field of a ring, at the lanes at i."""
-    return load(ring, ring_row(field, y - k, frame) + i) + load(ring, ring_row(field, y + k, frame) + i)
+    return load(ring, ring_at(ring, field, y - k, i, frame)) + load(ring, ring_at(ring, field, y + k, i, frame))
 
 
 @formula
@@ -147,7 +149,7 @@ def blur_down(ring, field, y, i, frame):
         two_rows(ring, field, y, 1, i, frame), two_rows(ring, field, y, 2, i, frame), two_rows(ring, field, y, 3, i, frame),
         two_rows(ring, field, y, 4, i, frame), two_rows(ring, field, y, 5, i, frame),
     )  # fmt: skip
-    return weighted(load(ring, ring_row(field, y, frame) + i), pairs, frame.taps)
+    return weighted(load(ring, ring_at(ring, field, y, i, frame)), pairs, frame.taps)
 
 
 @formula
@@ -182,17 +184,17 @@ def moments_along(rows, field, frame, ring, first, y):
             before, after = load(rows, begin + i - k) - middle, load(rows, begin + i + k) - middle
             shift += (before + after) * frame.taps[k]
             square += (before * before + after * after) * frame.taps[k]
-        store(ring, ring_row(first, y, frame) + i, middle + shift)
-        store(ring, ring_row(first + 1, y, frame) + i, square - shift * shift)
+        store(ring, ring_at(ring, first, y, i, frame), middle + shift)
+        store(ring, ring_at(ring, first + 1, y, i, frame), square - shift * shift)
 
 
 @formula
 def moments_down(ring, first, y, i, frame):
     """The window's mean and variance at row y, at the lanes at i, from two fields of the ring."""
-    middle = load(ring, ring_row(first, y, frame) + i)
+    middle = load(ring, ring_at(ring, first, y, i, frame))
     shift = square = middle * 0.0
     for k in range(1, REACH + 1):
-        above, below = ring_row(first, y - k, frame) + i, ring_row(first, y + k, frame) + i
+        above, below = ring_at(ring, first, y - k, i, frame), ring_at(ring, first, y + k, i, frame)
         before, after = load(ring, above) - middle, load(ring, below) - middle
         shift += (before + after) * frame.taps[k]
         square += (before * before + after * after) * frame.taps[k]
