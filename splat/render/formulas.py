@@ -92,14 +92,16 @@ def reciprocal(x):
 
 @formula
 def alpha_row(v, terms, running, cap):
-    """alpha of a row of pixels, and 2^l, its value before the cap; running: mask of the pixels that have not stopped.
+    """alpha of a row of pixels, and 2^l, its value before the cap; running: mask of the pixels that have not stopped, or None.
 
     terms: v of row 0, its step per row, log2 o - u^2, cut.  An explicit fma gives l the same rounding in every kernel, so that
     all kernels agree on which pixels are active.
     """
     l = fma(-v, v, terms[2])
-    uncapped = exp2(l)
-    return select((l >= terms[3]) & running, minimum(uncapped, cap), 0.0), uncapped
+    uncapped, active = exp2(l), l >= terms[3]
+    if running is not None:
+        active = active & running
+    return select(active, minimum(uncapped, cap), 0.0), uncapped
 
 
 @formula

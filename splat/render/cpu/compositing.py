@@ -27,7 +27,6 @@ from splat.render.cpu.tile import (
     FORWARD,
     GRAD,
     IMAGE,
-    NEVER,
     PARAMS,
     REST,
     STOP,
@@ -36,11 +35,13 @@ from splat.render.cpu.tile import (
     clear_sums,
     corner_of,
     dark,
+    fetch_row,
     intersection,
     intersections_of,
     kept_at,
     load3,
     load_cotangent,
+    next_corner,
     next_tile,
     no_moments,
     row_at,
@@ -68,56 +69,49 @@ def forward(counter, params, lists, frame, pixels):
             b = FORWARD * L * y
             here = inside & (pixel_rows(params) < broadcast(params, frame.height - y0 - PIXEL_ROWS * y))
             store(state, b + T * L, select(here, broadcast(params, 1.0), -1.0))
-            store(state, b + STOP * L, select(here, broadcast(params, NEVER), 0.0))
+            store(state, b + STOP * L, 0.0)
             store3(state, b + IMAGE * L, L, (0.0, 0.0, 0.0))
         first, count = intersections_of(lists, tile)
-        some_stopped = False
-        # front to back; every 16 splats, if a pixel has stopped since the last look: have all?
+        # front to back; every 16 splats: have all pixels stopped?
         for k in range(count):
             prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
-            some_stopped |= composite(params, lists, first + k, k, x0, y0, frame, state)
-            if some_stopped and (k & 15) == 15:
-                some_stopped = False
-                if all_stopped(state, L):
-                    break
+            fetch_row(pixels.planes, 4, corner, k, frame)
+            composite(params, lists, first + k, k, x0, y0, frame, state)
+            if (k & 15) == 15 and all_stopped(state, L):
+                break
         furthest = broadcast(params, 0.0)
         for y in range(TILE_ROWS):
             furthest = maximum(furthest, load(state, (FORWARD * y + STOP) * L))
             end_row(state, FORWARD * L * y, L, frame, pixels, row_at(corner, y, frame), kept_at(tile, y, L))
         store(state, 0, furthest)
-        pixels.reached[tile] = np.int64(min(count, state[:L].max()))
+        pixels.reached[tile] = np.int64(state[:L].max())
         tile = next_tile(counter, lists)
 
 
 @formula
 def composite(params, lists, e, k, x0, y0, frame, state):
-    """Composite intersection e, number k of its tile; True if it stopped a pixel."""
+    """Composite intersection e, number k of its tile."""
     L = lanes(params)
     _splat, _u, terms, colour, index, top, bottom = intersection(params, lists, e, k, x0, y0)
-    zero = broadcast(params, 0.0)
-    ended = zero > zero
+    following = index + 1.0
     for y in range(top, bottom):
         b = FORWARD * L * y
         before = load(state, b + T * L)
-        # alpha of the row, 0 where the pixel has stopped
-        alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, before > 0.0, frame.cap)
+        alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, None, frame.cap)
         after = fma(-alpha, before, before)  # T - alpha T, rounded once
-        w = select(after >= frame.floor, alpha * before, 0.0)
-        # other pixels stop in front of the splat, if they have not before; a branch would often be mispredicted
-        ends = (before > 0.0) & (after < frame.floor)
-        ended = ended | ends
-        store(state, b + STOP * L, select(ends, index, load(state, b + STOP * L)))
-        # image += w c, T -= w (or its sign turns), with the splat's colour c
-        store(state, b + T * L, select(ends, -before, after))
+        # other pixels stop in front of the splat, or have stopped: T's sign turns, or stays
+        runs = after >= frame.floor
+        store(state, b + T * L, select(runs, after, -abs(before)))
+        store(state, b + STOP * L, select(runs, following, load(state, b + STOP * L)))
+        # image += w c with the splat's colour c
+        w = select(runs, alpha * before, 0.0)
         store3(state, b + IMAGE * L, L, plus(load3(state, b + IMAGE * L, L), w, colour))
-    return any_lane(ended)
 
 
 @formula
 def end_row(state, b, L, frame, pixels, p, kept):
     """Add the background to a row, and write its colour and alpha at p of each plane, its final T and stops at `kept`."""
-    # the final T, of stopped pixels too
-    last = maximum(load(state, b + T * L), -load(state, b + T * L))
+    last = abs(load(state, b + T * L))
     store(pixels.transmittance, kept, last)
     store(pixels.stop, kept, load(state, b + STOP * L))
     image = plus(load3(state, b + IMAGE * L, L), last, frame.background)
@@ -156,8 +150,10 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
         if dark(v_planes, 0, 4, corner, frame):
             clear_sums(lists, first, count, SPLAT, sums)
             count = 0
+        following = next_corner(counter, lists, L, frame)
         # back to front
         for k in range(count - 1, -1, -1):
+            fetch_row(v_planes, 4, following, count - 1 - k, frame)
             later = first + max(k - AHEAD, 0)
             prefetch(params, np.int64(lists.splat[later]) * PARAMS)
             prefetch(sums, np.int64(lists.accumulator[later]) * SPLAT)

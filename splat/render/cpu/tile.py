@@ -29,13 +29,13 @@ from splat.backend.cpu.simd import (
     fma,
     load,
     load_double,
+    prefetch,
     select,
     store,
     store_sums,
 )
 from splat.render.formulas import SPLAT, along_row, alpha_row, column_terms, reciprocal, row_terms
 
-NEVER = 1e30  # the stop index of a pixel that does not stop
 AHEAD = 6  # intersections between a prefetch and its use
 
 # A splat's numbers, one cache line in float32: in float64 its mean x, y (pixel index units) and the whitening's shear; then the
@@ -45,7 +45,7 @@ MX, MY, SHEAR = 0, 2, 4
 ALONG, ACROSS, STEP, LO, RED, GREEN, BLUE, CUT = range(6, 14)
 
 # The vectors that a kernel keeps of a row of pixels, in this order; a number is the first of its channels.
-T, STOP = 0, 1  # transmittance, and the index of the intersection at which a pixel stops
+T, STOP = 0, 1  # transmittance, and the number of the intersection from which on none reaches the pixel
 IMAGE, FORWARD = 2, 5
 REST, GRAD, BACKWARD = 2, 3, 6  # R and v_image
 BEHIND, UNDO = 2, 5  # the colour behind, of the passes in `blocks.py` and `footprints.py`
@@ -110,6 +110,13 @@ def next_tile(counter, lists):
     """The next tile that no thread has taken, or -1."""
     turn = fetch_and_increment(counter)
     return lists.order[turn] if turn < lists.order.size else np.int64(-1)
+
+
+@formula
+def next_corner(counter, lists, lanes, frame):
+    """Index in a plane of the first pixel of this thread's next tile, unless another thread takes that tile."""
+    tile = lists.order[min(counter[0], lists.order.size - 1)]
+    return corner_of(tile, lanes, frame.columns, frame.stride)[2]
 
 
 @formula
@@ -247,6 +254,17 @@ def store_planes(planes, p, frame, image, alpha):
     for c in range(3):
         store_pixels(planes, c * frame.size + p, frame.stride, image[c])
     store_pixels(planes, 3 * frame.size + p, frame.stride, alpha)
+
+
+@formula
+def fetch_row(planes, count, corner, i, frame):
+    """Bring row i of a tile's pixels, in `count` planes, into the cache before it is read or written; nothing behind the last.
+
+    The rows of a tile are far apart in memory, and the processor does not foresee them: a quarter of the forward pass.
+    """
+    if i < TILE_HEIGHT:
+        for plane in range(count):
+            prefetch(planes, plane * frame.size + corner + i * frame.stride)
 
 
 @formula
