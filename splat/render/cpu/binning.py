@@ -79,8 +79,9 @@ def list_tiles(start, stop, splats, order, boxes, tile, columns, width, height, 
     block = scratch(np.empty(0), 2 * L)
     for i in range(start, stop):
         s, k, later = order[i], place[i], np.int64(order[min(i + AHEAD, stop - 1)])
-        prefetch(splats, later * SPLAT)
-        prefetch(boxes, later * BOX)
+        for j in (0, 4):  # both lines of the cache in which each may lie
+            prefetch(splats, later * SPLAT + j)
+            prefetch(boxes, later * BOX + j)
         if place[i + 1] > k:
             splat = (splats[s, 0], splats[s, 1], splats[s, 2], splats[s, 3], splats[s, 4])
             ellipse = (boxes[s, 0], boxes[s, 1], broadcast(block, boxes[s, 2]), boxes[s, 3])
