@@ -48,7 +48,9 @@ def draw(runs: Sequence[Path]) -> Figure:
         figure = new_figure(7.4, WIDTH)
         above, below = figure.subfigures(2, 1, height_ratios=[3.6, 1], squeeze=False)[:, 0]
         maps = [above.add_subplot(3, 2, 3 + i) for i in range(len(runs))]
-        photograph, renders = _photograph(runs[0], view), [imread(run / RENDERS / view) for run in runs]
+        path, renders = runs[0] / RENDERS / PANELS / view, [imread(run / RENDERS / view) for run in runs]
+        # the left of the panel that a training wrote beside the render, where it is there
+        photograph = imread(path)[:, : renders[0].shape[1]] if path.is_file() else None
         part = most_different(*renders)
         pictures = below.subplots(1, len(runs) + (photograph is not None), squeeze=False)[0]
         for axes in pictures:
@@ -126,12 +128,6 @@ def _score(run: Path, view: str) -> str:
     if (own := scores.test.views.get(view)) is not None and own.psnr is not None:
         return f"{own.psnr:.2f} dB"
     return "not scored" if scores.test.psnr is None else f"{scores.test.psnr:.2f} dB, mean of all views"
-
-
-def _photograph(run: Path, view: str) -> np.ndarray | None:
-    """The left of the panel that a training wrote beside the render; None where it is not there."""
-    path = run / RENDERS / PANELS / view
-    return imread(path)[:, : imread(run / RENDERS / view).shape[1]] if path.is_file() else None
 
 
 def _views(run: Path) -> set[str]:

@@ -122,9 +122,10 @@ def plane(record: Record) -> Plane:
         raise InputError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
     exponent = exponent_of(changes[0])
     masked = [np.ma.masked_invalid(change / 10.0**exponent) for change in changes]
-    common = exponent_of(arrays["x"], arrays["y"])
+    common, spans = exponent_of(arrays["x"], arrays["y"]), sorted((np.ptp(arrays["x"]), np.ptp(arrays["y"])))
+    alike = spans[1] < 100 * spans[0]  # both axes read well with the same power of ten taken out
     directions = [
-        direction(d, steps, common if _alike(arrays) else exponent_of(steps))
+        direction(d, steps, common if alike else exponent_of(steps))
         for d, steps in zip(about.directions, (arrays["x"], arrays["y"]), strict=True)
     ]
     return Plane(
@@ -145,12 +146,6 @@ def direction(about: schema.Direction, steps: np.ndarray, exponent: int) -> Dire
     curvature, unit = (np.nan if number is None else number for number in (about.curvature, about.unit))
     scale = about.scale or Direction.scale
     return Direction(literal(about.name), curvature, unit, steps, exponent, literal(scale), about.kind or "")
-
-
-def _alike(arrays: dict[str, np.ndarray]) -> bool:
-    """Whether both axes read well with the same power of ten taken out."""
-    spans = sorted((np.ptp(arrays["x"]), np.ptp(arrays["y"])))
-    return spans[1] < 100 * spans[0]
 
 
 def same_scale(x: float, y: float) -> bool:

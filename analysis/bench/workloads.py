@@ -150,9 +150,6 @@ class ViewBench:
         splats, depths, drawn = self.backend.project(self.workload.gaussians, self.lens)
         raster = self._rasterize((splats, depths, drawn))
         adjoint = raster.backward(self.loss.linearize(raster.planes, second_order=False).gradient)
-        return self._to_parameters(splats, drawn, adjoint)
-
-    def _to_parameters(self, splats: torch.Tensor, drawn: torch.Tensor, adjoint: Any) -> torch.Tensor:
         bar = plain_gradient(splats, adjoint.moments)
         return self.backend.project_vjp(self.workload.gaussians, self.lens, splats, drawn, bar)
 

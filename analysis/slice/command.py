@@ -74,7 +74,9 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
     require_seed(options.seed)
     shape = Shape.of(options.along, options.dimension, options.radius, options.points, len(options.others))
     device = device_named(options.device)
-    settings = _settings(options, device)
+    # a thread for each render on a CPU, one render at a time on a GPU
+    workers = torch.get_num_threads() if device.type == "cpu" else 1
+    settings = SliceSettings(None if options.all_points else options.tolerance, workers=workers)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
     unfinished, console, start = out.with_name(f".{out.name}.unfinished"), Console(stderr=True), perf_counter()
     require_replaceable(out, SliceRecord.FILE)
@@ -114,12 +116,6 @@ def _asked(options: SliceOptions, settings: SliceSettings) -> dict[str, Any]:
     """What changes the numbers; how many renders are made at a time does not."""
     amounts = {name: value for name, value in asdict(settings).items() if name != "workers"}
     return amounts | {name: getattr(options, name) for name in ("along", "dimension", "radius", "points")}
-
-
-def _settings(options: SliceOptions, device: torch.device) -> SliceSettings:
-    """Settings of the slice: a thread for each render on a CPU, one render at a time on a GPU."""
-    tolerance = None if options.all_points else options.tolerance
-    return SliceSettings(tolerance, workers=torch.get_num_threads() if device.type == "cpu" else 1)
 
 
 def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:

@@ -173,7 +173,9 @@ def cell(scene: Scene, study: Study, rule: str, seed: int) -> list[Row]:
             left = [name for name in pool if name not in chosen]
             added = pool[drawn[turn - 1]] if rule == "random" else _pick(training, views, chosen, left, rule)
             chosen.append(added)
-        _train_on(training, [views[name] for name in chosen], study.first_steps + turn * study.steps)
+        training.order = []
+        steps = train(training, [views[name] for name in chosen])
+        next(done for done in steps if done.step == study.first_steps + turn * study.steps)
         scores = evaluate(training.gaussians, held_out, scene.background)
         row: Row = {"round": turn, "views": len(chosen), "added": added, "psnr": scores.psnr, "ssim": scores.ssim}
         rows.append(row)
@@ -187,13 +189,6 @@ def _pick(training: Training, views: dict[str, View], chosen: list[str], left: l
     config = training.config
     known = informations(training.gaussians, cameras, config.background_colour(torch.float32), config.render)
     return picked([known[name] for name in chosen], known, left, 1, rule)[0]
-
-
-def _train_on(training: Training, views: list[View], until: int) -> None:
-    training.order = []
-    for done in train(training, views):
-        if done.step == until:
-            return
 
 
 def draw_study(table: pd.DataFrame) -> Figure:

@@ -83,7 +83,9 @@ def synthetic_scene(settings: SyntheticSettings = SyntheticSettings()) -> Synthe
     (('images/view_000.png', 'images/view_001.png'), True)
     """
     generator = torch.Generator().manual_seed(settings.seed)
-    truth = _gaussians(_still_life(settings.gaussians, generator), settings.sh_degree, generator)
+    shares = {_floor: 0.36, _wall: 0.22, _ball: 0.16, _ring: 0.12, _box: 0.14}  # of the Gaussians
+    surfaces = [build(round(share * settings.gaussians), generator) for build, share in shares.items()]
+    truth = _gaussians(surfaces, settings.sh_degree, generator)
     cameras = _arc_of_cameras(settings)
     with torch.no_grad():
         renderings = [render(truth, camera, depth=True) for camera in cameras]
@@ -94,12 +96,6 @@ def synthetic_scene(settings: SyntheticSettings = SyntheticSettings()) -> Synthe
     points = _points(truth, frames, renderings, settings, generator)
     scene = Scene("synthetic", Path("synthetic"), "synthetic", tuple(frames), points, torch.zeros(3))
     return SyntheticScene(scene, truth)
-
-
-def _still_life(n: int, generator: torch.Generator) -> list[Surface]:
-    """Floor, wall, ball, ring and box, with their shares of the Gaussians."""
-    shares = {_floor: 0.36, _wall: 0.22, _ball: 0.16, _ring: 0.12, _box: 0.14}
-    return [build(round(share * n), generator) for build, share in shares.items()]
 
 
 def _lattice(n: int, generator: torch.Generator) -> Float[Tensor, "n 2"]:

@@ -92,11 +92,6 @@ class CpuRaster:
         """The intersections that some pixel reaches, and (n + 1,) the first accumulator of each splat."""
         return binning.reached_lists(self.lists, self.pixels.reached, len(self.splats))
 
-    def _tiles(self, planes: np.ndarray) -> np.ndarray:
-        """Planes as (planes, rows of tiles, TILE_HEIGHT, tiles in a row, pixels in a row of a tile)."""
-        columns = self.frame.columns
-        return planes.reshape(len(planes), -1, TILE_HEIGHT, columns, self.plane[1] // columns)
-
     @property
     def draw_order(self) -> int:
         return hash((self.lists.start.tobytes(), self.lists.splat.tobytes()))
@@ -117,7 +112,9 @@ class CpuRaster:
 
     def dark_tiles(self, adjoint: "CpuAdjoint", curvature: Float[Tensor, "3 H W"]) -> int:
         planes = torch.cat([adjoint.cotangent, curvature]).numpy()
-        lit = self._tiles(planes != 0).any(axis=(0, 2, 4)).reshape(-1)
+        # planes, rows of tiles, rows of a tile, tiles in a row, pixels in a row of a tile
+        shape = len(planes), -1, TILE_HEIGHT, self.frame.columns, self.plane[1] // self.frame.columns
+        lit = (planes != 0).reshape(shape).any(axis=(0, 2, 4)).reshape(-1)
         return int(((np.diff(self.reached[0].start) > 0) & ~lit).sum())
 
     @property
