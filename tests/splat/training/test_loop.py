@@ -1,6 +1,7 @@
 """The training loop: schedules, determinism, and what a saved training resumes to."""
 
 from dataclasses import replace
+from itertools import pairwise
 from math import sqrt
 
 import pytest
@@ -133,6 +134,18 @@ def test_every_parameter_has_the_rate_of_its_attribute_and_band():
     each = gaussians.with_flat(learning_rates(gaussians, rates, 6.0)).attributes
     assert (each["means"] == 6).all() and (each["log_scales"] == 1).all() and (each["quats"] == 2).all()
     assert (each["opacity_logits"] == 3).all() and (each["sh"][:, 0] == 4).all() and (each["sh"][:, 1:] == 5).all()
+
+
+def test_the_vector_of_rates_is_kept_until_the_gaussians_or_their_rates_are_others():
+    training, kept = Training.start(tiny_gaussians(), EXTENT, tiny_config()), []
+    for step in range(1, 6):
+        training.raise_sh_degree(step // 3)
+        config = training.config = replace(training.config, rates=LearningRates(quats=1e-3 * (step // 5 + 1)))
+        rates = training.rates(step)
+        position = position_rate(config.rates, EXTENT, step, config.iterations)
+        assert torch.equal(rates, learning_rates(training.gaussians, config.rates, position))
+        kept.append(rates)
+    assert [one is other for one, other in pairwise(kept)] == [True, False, True, False]
 
 
 def test_a_band_joins_after_every_so_many_steps_until_the_highest():
