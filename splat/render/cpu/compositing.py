@@ -72,7 +72,7 @@ def forward(counter, params, lists, frame, pixels):
             store(state, b + STOP * L, 0.0)
             store3(state, b + IMAGE * L, L, (0.0, 0.0, 0.0))
         first, count = intersections_of(lists, tile)
-        # front to back; every 16 splats: have all pixels stopped?
+        # front to back, with each splat a row of the planes fetched; every 16 splats: have all pixels stopped?
         for k in range(count):
             prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
             fetch_row(pixels.planes, 4, corner, k, frame)
@@ -150,8 +150,8 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
         if dark(v_planes, 0, 4, corner, frame):
             clear_sums(lists, first, count, SPLAT, sums)
             count = 0
+        # back to front, with each splat a row of the next tile fetched
         following = next_corner(counter, lists, L, frame)
-        # back to front
         for k in range(count - 1, -1, -1):
             fetch_row(v_planes, 4, following, count - 1 - k, frame)
             later = first + max(k - AHEAD, 0)

@@ -258,9 +258,9 @@ def store_planes(planes, p, frame, image, alpha):
 
 @formula
 def fetch_row(planes, count, corner, i, frame):
-    """Bring row i of a tile's pixels, in `count` planes, into the cache before it is read or written; nothing behind the last.
+    """Bring row i of a tile's pixels, in `count` planes, into the cache before it is read or written; i: any number.
 
-    The rows of a tile are far apart in memory, and the processor does not foresee them: a quarter of the forward pass.
+    The rows of a tile lie far apart in memory, where the processor does not foresee them.
     """
     if i < TILE_HEIGHT:
         for plane in range(count):
