@@ -58,7 +58,7 @@ class ShortRepr:
     """A dataclass, made with repr=False, that fits on three lines of a terminal: of large parts their kind and shape."""
 
     def __repr__(self) -> str:
-        parts = [f"{field.name}={_brief(getattr(self, field.name))}" for field in fields(self)]  # pyright: ignore[reportArgumentType]
+        parts = [f"{each.name}={_brief(getattr(self, each.name))}" for each in fields(self) if each.repr]  # pyright: ignore[reportArgumentType]
         text = f"{type(self).__name__}({', '.join(parts)})"
         return fill(text, LINE, max_lines=3, placeholder=" ...", subsequent_indent="  ", break_on_hyphens=False)
 

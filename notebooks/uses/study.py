@@ -174,8 +174,9 @@ def cell(scene: Scene, study: Study, rule: str, seed: int) -> list[Row]:
             added = pool[drawn[turn - 1]] if rule == "random" else _pick(training, views, chosen, left, rule)
             chosen.append(added)
         training.order = []
-        steps = train(training, [views[name] for name in chosen])
-        next(done for done in steps if done.step == study.first_steps + turn * study.steps)
+        for done in train(training, [views[name] for name in chosen]):
+            if done.step == study.first_steps + turn * study.steps:
+                break
         scores = evaluate(training.gaussians, held_out, scene.background)
         row: Row = {"round": turn, "views": len(chosen), "added": added, "psnr": scores.psnr, "ssim": scores.ssim}
         rows.append(row)

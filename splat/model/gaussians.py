@@ -183,7 +183,7 @@ class Gaussians(ShortRepr):
         if not len(self):
             raise InputError("expected at least one Gaussian, got none; begin with those of a checkpoint or of a scene")
         largest = torch.finfo(self.flat.dtype).max ** 0.25
-        if self._is_moderate(largest):  # as nearly all are, in a third of the time
+        if self._is_moderate(largest):  # as nearly all are, in a seventh of the time
             return
         sizes = {
             name: value.detach().reshape(len(self), -1).abs().amax(dim=1) for name, value in self.attributes.items()

@@ -272,7 +272,7 @@ class Training(ShortRepr):
     method: Method
     order: list[int] = field(default_factory=list)
     step: int = 0
-    _rates: tuple[tuple, Tensor] | None = field(default=None, init=False)  # the last of `rates`, and what they are of
+    _rates: tuple[tuple, Tensor] | None = field(default=None, init=False, repr=False)  # of `rates`
 
     @classmethod
     def start(cls, gaussians: Gaussians, extent: float, config: TrainConfig) -> "Training":
