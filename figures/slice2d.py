@@ -155,7 +155,7 @@ def _ticks(direction: Direction, field: Plane, most: int) -> Locator:
 
 
 def _legend(field: Plane) -> list[Line2D]:
-    handles = [Line2D([], [], color=BLACK, label="loss, renders")]
+    handles = [Line2D([], [], color=BLACK, label="loss")]
     if not (field.evaluated.all() or field.unresolved):
         size = "unbounded" if field.error is None else f"<{rough(100 * field.error)}%"
         words = f"plane: {field.evaluated.mean():.0%} rendered,\nelse interpolated (error {size})"

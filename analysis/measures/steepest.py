@@ -56,8 +56,8 @@ PLACES = (
     ("in the lower left", "at the bottom", "in the lower right"),
 )
 Pictures = dict[str, UInt8[np.ndarray, "..."]]
-# of `loss_nearby`: mass on the Gaussians followed, most of these, standard deviations to their edges, largest part of the views
-FOLLOWED, FEW, EDGE, PART = 0.99, 16, 3.5, 0.25
+# of `loss_nearby`: mass on the Gaussians followed, standard deviations to their edges, largest part of the views
+FOLLOWED, EDGE, PART = 0.99, 3.5, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,14 +157,14 @@ def loss_nearby(
     """The loss in boxes of the views around the few Gaussians that carry some unit vectors, less constants.
 
     As a function of the parameters it differs from the loss by what the other Gaussians change outside of the boxes: little,
-    and smoothly (a `control` of `landscape.evaluate_slice`); it takes a tenth of the time.  ends: the parameters that the
-    Gaussians move between.  None where they are many, their boxes a large part of the views, or the device not the CPU.
+    and smoothly (a `control` of `landscape.evaluate_slice`); it takes a tenth of the time, half at most.  ends: the
+    parameters that the Gaussians move between.  None where their boxes are a large part of the views, or not on a CPU.
     """
     active, found, pixels = objective.active, [], 0
     mass = torch.stack([masses(vector, active) for vector in vectors.T])
     shares, order = (mass / mass.sum(dim=1, keepdim=True)).sort(dim=1, descending=True)
     followed = order[(shares.cumsum(dim=1) - shares) < FOLLOWED].unique()
-    if backend_of(active.flat) is not CPU or len(followed) > FEW:
+    if backend_of(active.flat) is not CPU:
         return None
     # a box of any size has the windows of all of its pixels
     settings = replace(objective.loss_settings, border="padded")

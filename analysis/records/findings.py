@@ -243,7 +243,7 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
     if not plane.is_resolved:
         lines.append(Line(unresolved(plane, made), "caution"))
     elif rendered < plane.points:
-        text = f"Of the slice's {plane.points:,} points {rendered:,} are renders, among them all of both axes; the others are "
+        text = f"Of the slice's {plane.points:,} points {rendered:,} are renders; the others are "
         lines.append(Line(f"{text}interpolated, {_errors_of_interpolation(plane)}."))
     if plane.crossed_points:
         share = f"{plane.crossed_points:,} of the slice's {rendered:,} rendered points"

@@ -30,11 +30,11 @@ DIGITS = 9  # of distances: points that are as far but for round-off are taken i
 class PlaneInterpolant:
     """The interpolant on a grid x times y that has 0 in both.  Points are numbered as in the flattened grid.
 
-    axes: the points of both axes.  mixed: a.  through_axes: False for the spline of f itself, through all known points.
+    mixed: a.  through_axes: False for the spline of f itself, through all known points.  required: both axes; then the centre.
 
     >>> x = np.linspace(-1, 1, 9)
     >>> grid, f = PlaneInterpolant(x, x, mixed=0.5), (x[:, None] ** 2 + x * x[:, None] * (0.5 + x)).ravel()
-    >>> known = np.isin(np.arange(81), grid.axes)
+    >>> known = np.isin(np.arange(81), grid.required)
     >>> known[grid.farthest(known, 16)] = True
     >>> int(known.sum()), float(abs(grid(np.where(known, f, np.nan)) - f).max()) < 1e-14
     (33, True)
@@ -42,9 +42,9 @@ class PlaneInterpolant:
 
     def __init__(self, x: np.ndarray, y: np.ndarray, mixed: float | None = None, through_axes: bool = True):
         self._x, self._y, self._mixed, self._through_axes = x, y, mixed, through_axes
-        self._i, self._j = (int(np.flatnonzero(axis == 0)[0]) for axis in (x, y))
+        self._i, self._j = i, j = [int(np.flatnonzero(axis == 0)[0]) for axis in (x, y)]
         number = np.arange(len(x) * len(y)).reshape(len(x), len(y))
-        self.axes = np.unique(np.concatenate([number[:, self._j], number[self._i]]))
+        self.required = np.unique(np.r_[number[:, j], number[i]]) if through_axes else number[[i], j]
         places = np.meshgrid(*(axis / np.abs(axis).max() for axis in (x, y)), indexing="ij")
         self._places = np.stack(places, axis=-1).reshape(-1, 2)
 

@@ -1,6 +1,6 @@
 """Choice of the points at which a slice is evaluated: both axes, then points that fill the plane until they predict the others.
 
-    axes        every point: nothing is interpolated along a line, nor along the two sections of a plane
+    axes        every point: nothing is interpolated along a line, nor, without a control, along the two sections of a plane
     fill        the points farthest from all that are known: COARSE at first, then 3/4 as many as are known off the axes
     hold out    predict all points that are not known, then evaluate max(holdout, number filled) of them, at random: the more
                 they are, the closer the bound is to the largest error.  If the bound is within tolerance * range, the slice is
@@ -9,9 +9,9 @@
 bound: `interpolation.error_bound`, of the error at every point not known, from the errors at the points held out; the k-th
 hold-out may err with a chance of 5% / 2^k.  range: largest less smallest of the values evaluated.
 
-control: a cheap function that differs from the loss by little that is smooth.  It is refined first, in the same way, to half
-the tolerance.  Of the loss itself the axes and COARSE / 2 points are evaluated at first, and a third of a hold-out: the spline
-through its differences from the control predicts the others.  Both bounds are added.
+control: a cheap function that differs from the loss by little that is smooth.  It is refined first, in the same way, to 3/4 of
+the tolerance.  Of the loss itself the centre and COARSE points are evaluated at first, and a third of a hold-out: the spline
+through its differences from the control predicts the others, those of the axes, too.  Both bounds are added.
 
 A slice keeps the interpolant that was judged.  Fitting it again with the points held out made it worse in 95% of the draws on
 a fern's planes: some lie next to an axis, where its spline, divided by x y, magnifies jumps.  A plane whose bound is not
@@ -31,6 +31,7 @@ from landscape.slices.grid_evaluations import GridEvaluations
 from landscape.slices.interpolation import PlaneInterpolant, error_bound
 
 COARSE = 16  # points
+CONTROLLED = 0.75  # share of the tolerance that a control is refined to
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class SliceSettings:
         tolerance, at most 5.6% of the other points are not, with 97.5% confidence at the first hold-out; `error_bound`
         extrapolates to all.
     workers: threads that evaluate.
-    max_evaluations: budget; counts the axes and once more the centre, both always evaluated, and points of an earlier run.
+    max_evaluations: budget; counts the axes and once more the centre, always evaluated, and points of an earlier run.
         Allowed only with a tolerance.
     """
 
@@ -85,14 +86,14 @@ def evaluate_adaptively(
     generator: torch.Generator,
     control: tuple[GridEvaluations, Refined] | None = None,
 ) -> Refined:
-    """Evaluate in rounds until the others are predicted within the tolerance, or all are known; the axes in any case.
+    """Evaluate in rounds until the others are predicted within the tolerance, or all are known; `grid.required` in any case.
 
     A round that does not fit into max_evaluations is not begun.  control: evaluated and refined on the same grid.
     """
     assert settings.tolerance is not None
-    fill, holdout = (COARSE, settings.holdout) if control is None else (COARSE // 2, -(-settings.holdout // 3))
+    fill, holdout = COARSE, settings.holdout if control is None else -(-settings.holdout // 3)
     seen, looks, bound = np.empty(0), 0, inf
-    evaluations.require(grid.axes)
+    evaluations.require(grid.required)
     while not (known := evaluations.known).all():  # `require` sets entries of this array
         filling = grid.farthest(known, fill)
         drawn = _draw(known, filling, max(holdout, fill), generator)
@@ -108,7 +109,7 @@ def evaluate_adaptively(
         evaluations.require(drawn)
         errors, looks = np.abs(predicted + exact - evaluations.value)[drawn], looks + 1
         seen = np.abs(predicted + beside - evaluations.value)[drawn]
-        fill = 3 * int(known.sum() - len(grid.axes)) // 4
+        fill = 3 * int(known.sum() - len(grid.required)) // 4
         seen[~np.isfinite(seen)] = inf  # without a number no bound holds
         allowed = settings.tolerance * value_range(evaluations.value)
         bound = error_bound(errors, int((~known).sum()), looks) + others

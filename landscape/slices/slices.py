@@ -1,7 +1,6 @@
 """Slices of an objective L: its values on a grid along one or two directions e_d, and its quadratic model.
 
-    f(x)     = L(center + sum_d x_d e_d)              evaluated where needed (`refinement`), interpolated elsewhere,
-                                                      never on the axes
+    f(x)     = L(center + sum_d x_d e_d)              evaluated where needed (`refinement`), interpolated elsewhere
     model(x) = L + b . x + x^T A x / 2                b = E^T g,  A = E^T H E
 
 x is in multiples of the directions: for unit vectors in units of the parameters.  `curvature_reach` gives ranges in units of
@@ -23,7 +22,7 @@ from landscape.operators.operator import SymmetricOperator, product
 from landscape.results import Progress
 from landscape.slices.grid_evaluations import GridEvaluations, Loss, Store
 from landscape.slices.interpolation import PlaneInterpolant
-from landscape.slices.refinement import Refined, SliceSettings, evaluate_adaptively
+from landscape.slices.refinement import CONTROLLED, Refined, SliceSettings, evaluate_adaptively
 from landscape.slices.slice import Slice
 
 
@@ -143,8 +142,8 @@ def _refined(
     plane = PlaneInterpolant(x, y, mixed)
     if cheap is None:
         return evaluate_adaptively(found, plane, settings, generator)
-    half = replace(settings, tolerance=settings.tolerance / 2, max_evaluations=inf)
-    control = cheap, evaluate_adaptively(cheap, plane, half, generator)
+    most = replace(settings, tolerance=CONTROLLED * settings.tolerance, max_evaluations=inf)
+    control = cheap, evaluate_adaptively(cheap, plane, most, generator)
     return evaluate_adaptively(found, PlaneInterpolant(x, y, through_axes=False), settings, generator, control)
 
 

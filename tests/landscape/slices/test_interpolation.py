@@ -8,7 +8,7 @@ X, Y = np.linspace(-1, 1, 21), np.concatenate([np.linspace(-0.3, 0, 7), np.geoms
 
 def known(grid, values, more=()):
     """The values on the axes, at the 16 points farthest from these, and at some more; nan elsewhere."""
-    at = np.isin(np.arange(values.size), grid.axes)
+    at = np.isin(np.arange(values.size), grid.required)
     at[np.concatenate([grid.farthest(at, 16), more]).astype(int)] = True
     return np.where(at, values, np.nan)
 
@@ -25,11 +25,11 @@ def test_on_the_axes_and_where_it_is_known_the_interpolant_is_the_function():
 
 def test_the_farthest_points_fill_the_plane_from_its_corners_inwards():
     grid = PlaneInterpolant(np.linspace(-2, 2, 9), np.linspace(-1, 1, 9))
-    known = np.isin(np.arange(81), grid.axes)
+    known = np.isin(np.arange(81), grid.required)
     assert sorted(grid.farthest(known, 4)) == [0, 8, 72, 80]
     found = grid.farthest(known, 100)  # all there are, each once
     assert len(found) == 64 and set(found) == set(np.flatnonzero(~known))
-    gaps = [grid.farthest(np.isin(np.arange(81), [*grid.axes, *found[:n]]), 1)[0] for n in range(64)]
+    gaps = [grid.farthest(np.isin(np.arange(81), [*grid.required, *found[:n]]), 1)[0] for n in range(64)]
     assert gaps == list(found)  # as one by one
 
 

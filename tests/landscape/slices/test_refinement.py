@@ -162,15 +162,15 @@ def test_of_noise_every_point_is_evaluated():
 def test_with_a_control_that_has_the_jumps_few_evaluations_tell_the_rest():
     for seed in range(5):
         found = sliced(beside, seed, control=jumps)
-        off = errors(beside, found)
-        assert found.evaluations == 1 + 81 + 8 + 22 < sliced(beside, seed).evaluations
-        assert found.reason == "tolerance" and off.max() <= found.interpolation_error <= 0.01
-        assert 0 < found.error_seen <= found.interpolation_error
+        assert found.evaluations == 1 + 1 + 16 + 22 < sliced(beside, seed).evaluations and found.reason == "tolerance"
+        assert max(errors(beside, found).max(), found.error_seen) <= found.interpolation_error <= 0.01
 
 
 def test_a_control_without_the_jumps_costs_evaluations_and_no_accuracy():
-    found = sliced(jumps, control=bowl)
-    assert found.evaluations > 100 and errors(jumps, found).max() <= found.interpolation_error <= 0.01
+    found = [sliced(jumps, seed, control=bowl) for seed in range(10)]
+    assert all(each.evaluations > 100 and errors(jumps, each).max() <= 0.01 for each in found)
+    beyond = sum(errors(jumps, each).max() > each.interpolation_error for each in found)
+    assert beyond <= 3  # 0.5 and four standard errors
 
 
 def test_losses_that_are_not_finite_are_never_interpolated():
