@@ -57,7 +57,7 @@ PLACES = (
 )
 Pictures = dict[str, UInt8[np.ndarray, "..."]]
 # of `loss_nearby`: mass on the Gaussians followed, standard deviations to their edges, largest part of the views
-FOLLOWED, EDGE, PART = 0.99, 3.5, 0.5
+FOLLOWED, EDGE, PART = 0.99, 3.5, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def loss_nearby(
     """The loss in boxes of the views around the few Gaussians that carry some unit vectors, less constants.
 
     As a function of the parameters it differs from the loss by what the other Gaussians change outside of the boxes: little,
-    and smoothly (a `control` of `landscape.evaluate_slice`); it takes a tenth of the time, half at most.  ends: the
+    and smoothly (a `control` of `landscape.evaluate_slice`); it takes a tenth of the time.  ends: the
     parameters that the Gaussians move between.  None where their boxes are a large part of the views, or not on a CPU.
     """
     active, found, pixels = objective.active, [], 0
