@@ -157,8 +157,8 @@ def loss_nearby(
     """The loss in boxes of the views around the few Gaussians that carry some unit vectors, less constants.
 
     As a function of the parameters it differs from the loss by what the other Gaussians change outside of the boxes: little,
-    and smoothly (a `control` of `landscape.evaluate_slice`); it takes a tenth of the time.  ends: the
-    parameters that the Gaussians move between.  None where their boxes are a large part of the views, or not on a CPU.
+    and smoothly (a `control` of `landscape.evaluate_slice`); it takes a tenth of the time.  ends: the parameters that the
+    Gaussians move between.  None where their boxes are a large part of the views, or not on a CPU.
     """
     active, found, pixels = objective.active, [], 0
     mass = torch.stack([masses(vector, active) for vector in vectors.T])

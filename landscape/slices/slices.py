@@ -142,8 +142,8 @@ def _refined(
     plane = PlaneInterpolant(x, y, mixed)
     if cheap is None:
         return evaluate_adaptively(found, plane, settings, generator)
-    most = replace(settings, tolerance=CONTROLLED * settings.tolerance, max_evaluations=inf)
-    control = cheap, evaluate_adaptively(cheap, plane, most, generator)
+    tighter = replace(settings, tolerance=CONTROLLED * settings.tolerance, max_evaluations=inf)
+    control = cheap, evaluate_adaptively(cheap, plane, tighter, generator)
     return evaluate_adaptively(found, PlaneInterpolant(x, y, through_axes=False), settings, generator, control)
 
 
