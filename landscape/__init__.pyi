@@ -61,7 +61,6 @@ from .traces.diagonal import estimate_diagonal as estimate_diagonal
 from .traces.estimate import TraceEstimate as TraceEstimate
 from .traces.pixels import BlockEstimate as BlockEstimate
 from .traces.pixels import gauss_newton_blocks as gauss_newton_blocks
-from .traces.pixels import gauss_newton_diagonal as gauss_newton_diagonal
 from .traces.pixels import gauss_newton_traces as gauss_newton_traces
 from .traces.trace import PAPER as PAPER
 from .traces.trace import TraceSettings as TraceSettings

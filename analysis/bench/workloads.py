@@ -93,13 +93,9 @@ class Workload:
 def synthetic_workload(size: Size) -> Workload:
     """Four views of the synthetic scene, whose Gaussians have lost their exact colours, so that the loss is not at 0."""
     made = synthetic_scene(SyntheticSettings(size.count, 4, size.width, size.height, sh_degree=3))
-    return Workload(f"synthetic {size}", _discoloured(made.truth), tuple(made.scene.load()), made.scene.background)
-
-
-def _discoloured(gaussians: Gaussians) -> Gaussians:
-    gaussians = gaussians.select(torch.arange(len(gaussians)), 3)
+    gaussians = made.truth.select(torch.arange(len(made.truth)), 3)
     gaussians.sh.add_(0.1 * torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(0)))
-    return gaussians
+    return Workload(f"synthetic {size}", gaussians, tuple(made.scene.load()), made.scene.background)
 
 
 def workload_of(path: Path) -> Workload:

@@ -21,10 +21,7 @@ SQUARED = 1e-140, 1e140  # numbers whose squares, and sums of them, are floats w
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DiagonalEstimate(ShortRepr):
-    """diag H.  samples: one column for each test vector, with the mean `values`.
-
-    matvecs: products used.  method: "signs" or "pixels" (`pixels`, where products are samples).
-    """
+    """diag H.  samples: one column for each test vector, with the mean `values`; matvecs: products used."""
 
     values: Float64[Tensor, " n"]
     standard_errors: Float64[Tensor, " n"]

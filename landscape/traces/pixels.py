@@ -1,4 +1,4 @@
-"""Traces, diagonal and blocks of Gauss-Newton, G = J^T l'' J, of a renderer by backward passes alone: no step to choose.
+"""Traces and blocks of Gauss-Newton, G = J^T l'' J, of a renderer by backward passes alone: no step to choose.
 
 z is a vector of standard normal numbers, one for each number of the image of a view.  As E z z^T = I, E u c^T = J^T l'' J for
 
@@ -24,7 +24,6 @@ from landscape.linalg import gram
 from landscape.operators.operator import require_finite
 from landscape.operators.renderer import RendererHessian
 from landscape.probes import draw_probes
-from landscape.traces.diagonal import DiagonalEstimate, mean_diagonal
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.hutchinson import GROUP, LEAST
 from landscape.traces.quadratic import FEWEST, mean_interval, power_sums
@@ -70,19 +69,13 @@ def gauss_newton_traces(
     return found
 
 
-def gauss_newton_diagonal(H: RendererHessian, generator: torch.Generator, samples: int = 32) -> DiagonalEstimate:
-    """diag G with a standard error for every entry, from so many samples (3 or more); keeps n x samples numbers in float64."""
-    sampled = _sampled(H, generator, *_sizes(samples, 3, samples))
-    products = (U.double() * C.double() / len(H.views) for U, C in sampled)
-    return mean_diagonal(sum(products, torch.zeros(())), H, samples, "pixels")
-
-
 def gauss_newton_blocks(
     H: RendererHessian, generator: torch.Generator, groups: Int64[Tensor, "g d"], samples: int = 32
 ) -> BlockEstimate:
     """The block of G on each group of d rows, from so many samples (3 or more).
 
-    groups: numbers of rows; for Gaussians, a row for each with the numbers of its 3, 6 or 11 parameters.
+    groups: numbers of rows; for Gaussians, a row for each with the numbers of its 3, 6 or 11 parameters; of one number
+    each, they are the diagonal.
     """
     if groups.ndim != 2 or groups.is_floating_point() or not ((groups >= 0) & (groups < H.dim)).all():
         raise InputError(

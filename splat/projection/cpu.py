@@ -14,7 +14,7 @@ from splat.backend.cpu.dual import exp, select
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.memory import gather, gather_one, scatter, scatter_one, scratch, store_all, store_where
 from splat.backend.cpu.simd import any_lane, broadcast, lanes, load, load_all, store
-from splat.backend.cpu.threads import over_range
+from splat.backend.cpu.threads import LIGHT, over_range
 from splat.model.gaussians import Gaussians, layout
 from splat.projection.antialias import antialiased_adjoint, antialiased_geometry, log_sizes, widths_of
 from splat.projection.formulas import (
@@ -232,6 +232,6 @@ def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.nda
     arrays = attribute_arrays(gaussians)
     n, dtype = len(gaussians), arrays[0].dtype
     splats, depths, drawn = np.empty((n, 9)), np.empty(n, dtype), np.empty(n, np.bool_)
-    over_range(n, project_splats, lens, *arrays, width_array(gaussians, lens), splats, depths, drawn)
+    over_range(n, project_splats, lens, *arrays, width_array(gaussians, lens), splats, depths, drawn, least=LIGHT)
     require_sizes(lens, log_sizes(gaussians).numpy(), depths, drawn)
     return splats, depths, drawn

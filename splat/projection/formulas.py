@@ -159,13 +159,6 @@ def clamped(x, limit):
 
 
 @formula
-def unit_quaternion(quat):
-    w, x, y, z = quat
-    inverse = 1.0 / sqrt(w * w + x * x + y * y + z * z)
-    return (w * inverse, x * inverse, y * inverse, z * inverse), inverse
-
-
-@formula
 def columns_of_rotation(unit):
     """The three columns of the rotation of a unit quaternion w x y z: the axes of the Gaussian."""
     w, x, y, z = unit
@@ -190,7 +183,8 @@ def projected_axes(lens, mean, scales, quat):
     x, y, z = to_camera(lens, offset_from(lens, mean))
     depth = 1.0 / z
     u, v = clamped(x * depth, lens.limit_x), clamped(y * depth, lens.limit_y)
-    unit, inverse_norm = unit_quaternion(quat)
+    inverse_norm = 1.0 / sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
+    unit = quat[0] * inverse_norm, quat[1] * inverse_norm, quat[2] * inverse_norm, quat[3] * inverse_norm
     c0, c1, c2 = columns_of_rotation(unit)
     m0 = scaled(to_camera(lens, c0), scales[0])
     m1 = scaled(to_camera(lens, c1), scales[1])

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from splat.backend.cpu.adam import adam_step
-from splat.backend.cpu.threads import over_range
+from splat.backend.cpu.threads import LIGHT, over_range
 from splat.losses.cpu.loss import NUMPY, CpuImageLoss, CpuViewLoss
 from splat.losses.protocols import ImageLoss, ViewLoss
 from splat.losses.reference import LossSettings
@@ -243,11 +243,11 @@ class CpuBackend:
     def add_screen_gradients(self, total, renders, gradient, splats, camera):
         arrays = (each.numpy() for each in (splats.means, splats.conics, splats.drawn, gradient))
         halves = camera.width / 2, camera.height / 2
-        over_range(len(total), cpu.add_screen_gradients, *arrays, *halves, total.numpy(), renders.numpy())
+        over_range(len(total), cpu.add_screen_gradients, *arrays, *halves, total.numpy(), renders.numpy(), least=LIGHT)
 
     def convert(self, way, splats, numbers):
         out = np.empty(splats.shape)
-        over_range(len(splats), cpu.convert, way, splats.numpy(), numbers.numpy(), out)
+        over_range(len(splats), cpu.convert, way, splats.numpy(), numbers.numpy(), out, least=LIGHT)
         return torch.from_numpy(out)
 
     def view_loss(self, target, settings, like) -> ViewLoss:

@@ -14,6 +14,7 @@ from functools import cache
 import numpy as np
 import torch
 
+LIGHT = 8192  # numbers that take some ten nanoseconds each: fewer are not worth the start of a thread
 ALIGNED = 16  # matrices: of whatever size, these many begin at a multiple of 64 bytes, in float32 and in float64
 
 
@@ -51,9 +52,9 @@ def _run(calls: list[tuple]) -> None:
             future.result()
 
 
-def over_range(size: int, kernel: Callable, *arguments) -> None:
-    """kernel(start, stop, *arguments) over contiguous parts of range(size)."""
-    parts = min(thread_count(), max(size, 1))
+def over_range(size: int, kernel: Callable, *arguments, least: int = 1) -> None:
+    """kernel(start, stop, *arguments) over contiguous parts of range(size), as many as threads, none shorter than `least`."""
+    parts = min(thread_count(), max(size // least, 1))
     _run([(kernel, size * t // parts, size * (t + 1) // parts, *arguments) for t in range(parts)])
 
 

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from landscape.errors import InputError, lacks_memory
-from splat.model.files.ply import Header, read_header, read_rows
+from splat.model.files.ply import read_header, read_rows
 from splat.model.files.splat_file import SplatFile, clamped_note, logit, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00, harmonics
@@ -61,10 +61,6 @@ def read_dot_splat(content: bytes) -> SplatFile:
         "sh": ((rows["rgba"][:, None, :3] / 255) - 0.5) / Y00,
     }
     return SplatFile(packed(attributes), ".splat", lossy=True, notes=clamped_note(clamped))
-
-
-def is_compressed(header: Header) -> bool:
-    return any(element.name == "chunk" for element in header.elements)
 
 
 def read_compressed_ply(content: bytes) -> SplatFile:

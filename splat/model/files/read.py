@@ -51,9 +51,8 @@ def is_foreign(path: Path) -> bool:
         try:
             with zipfile.ZipFile(file) as archive:
                 require_modest(archive)
-                return not tensor_files.is_own(archive) and (
-                    tensor_files.is_tensor_file(archive) or quantised.is_sog(archive)
-                )
+                theirs = tensor_files.pickles_of(archive) or quantised.is_sog(archive)
+                return bool(theirs) and not tensor_files.is_own(archive)
         except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError):
             return False  # `load_checkpoint` says what is wrong with it
 
@@ -79,7 +78,7 @@ def _read(path: Path, content: bytes) -> SplatFile:
     if content.startswith(LICHTFELD):
         raise InputError("it is LichtFeld's own format, which changes often: export a PLY there")
     if content.startswith(MAGIC):
-        compressed = quantised.is_compressed(read_header(content))
+        compressed = any(element.name == "chunk" for element in read_header(content).elements)
         return quantised.read_compressed_ply(content) if compressed else read_splat_ply(content)
     if content.startswith((quantised.GZIP_MAGIC, quantised.SPZ_MAGIC)):
         return quantised.read_spz(content)

@@ -41,14 +41,10 @@ NUMPY_TYPES = ("Float64DType", "Float32DType", "Int64DType", "Int32DType", "Bool
 
 def is_own(archive: zipfile.ZipFile) -> bool:
     """Whether `splat.training.checkpoint` wrote it."""
-    return any(OWN in archive.read(name) for name in _pickles(archive))
+    return any(OWN in archive.read(name) for name in pickles_of(archive))
 
 
-def is_tensor_file(archive: zipfile.ZipFile) -> bool:
-    return bool(_pickles(archive))
-
-
-def _pickles(archive: zipfile.ZipFile) -> list[str]:
+def pickles_of(archive: zipfile.ZipFile) -> list[str]:
     found = archive.infolist()
     return [info.filename for info in found if info.filename.endswith("/data.pkl") and info.file_size < 1 << 26]
 

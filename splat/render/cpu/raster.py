@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, aligned
 from splat.backend.cpu.simd import lanes_of
-from splat.backend.cpu.threads import over_range, over_tiles
+from splat.backend.cpu.threads import LIGHT, over_range, over_tiles
 from splat.losses.cpu.loss import CpuLinearLoss
 from splat.model.settings import RenderSettings
 from splat.render.cpu import binning, blocks, compositing, coupling, footprints, packing, tangents, tile
@@ -62,7 +62,7 @@ class CpuRaster:
     def pack(self) -> None:
         """Fill `params`, the splats as the passes over the pixels read them."""
         arguments = (self.splats.numpy(), self.thresholds.least, self.thresholds.contour, self.params)
-        over_range(len(self.splats), packing.pack_splats, *arguments)
+        over_range(len(self.splats), packing.pack_splats, *arguments, least=LIGHT)
 
     def forward(self) -> None:
         """Fill `pixels`: the image, and where its pixels stop."""

@@ -4,8 +4,8 @@ A vector of pixels is `lanes` / PIXEL_ROWS wide and PIXEL_ROWS high, as few spla
 TILE_ROWS vectors, one below the other; the kernels call each a row.  An intersection is a splat in a tile.  Each writes
 its nine sums (six moments of s, three of colour: `render/formulas.py`) to an accumulator of its own, and those of a splat lie
 side by side, so that no sum depends on the order in which threads finish.  Every kernel (`compositing.py`, `tangents.py`,
-`blocks.py`) takes tiles from a counter until none is left (`threads.over_tiles`).  Arrays are flat: `params` holds PARAMS
-floats a splat, `tangents` K x SPLAT floats a splat, a plane stride x height floats.
+`blocks.py`) takes pairs of tiles from a counter until none is left (`threads.over_tiles`).  Arrays are flat: `params` holds
+PARAMS floats a splat, `tangents` K x SPLAT floats a splat, a plane stride x height floats.
 """
 
 from typing import NamedTuple
@@ -58,7 +58,7 @@ class Lists(NamedTuple):
 
     start: (tiles + 1,) first intersection of each tile; splat: (intersections,); rows: (intersections,) first row |
     last row << 8 within the tile; accumulator: (intersections,) where their sums go, splat by splat;
-    order: the tiles as they are handed out.
+    order: the first tiles of pairs, as pairs are handed out.
     """
 
     start: np.ndarray
@@ -106,17 +106,22 @@ class Pixels(NamedTuple):
 
 
 @formula
-def next_tile(counter, lists):
-    """The next tile that no thread has taken, or -1."""
+def next_tile(counter, lists, tile):
+    """The tile after a thread's last one (-1 before the first): the other of its pair, or the next pair's first; -1 at the end.
+
+    The tiles of a pair share the cache lines of their rows: two threads that write to one line wait for each other.
+    """
+    if tile & 1 == 0:
+        return tile + 1
     turn = fetch_and_increment(counter)
     return lists.order[turn] if turn < lists.order.size else np.int64(-1)
 
 
 @formula
-def next_corner(counter, lists, lanes, frame):
-    """Index in a plane of the first pixel of this thread's next tile, unless another thread takes that tile."""
-    tile = lists.order[min(counter[0], lists.order.size - 1)]
-    return corner_of(tile, lanes, frame.columns, frame.stride)[2]
+def next_corner(counter, lists, tile, lanes, frame):
+    """Index in a plane of the first pixel of the tile after this one, unless another thread takes that."""
+    following = tile + 1 if tile & 1 == 0 else lists.order[min(counter[0], lists.order.size - 1)]
+    return corner_of(following, lanes, frame.columns, frame.stride)[2]
 
 
 @formula

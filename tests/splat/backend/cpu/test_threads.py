@@ -56,14 +56,16 @@ def test_every_result_is_the_same_to_the_last_bit_on_one_two_and_five_threads(dt
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("size", [0, 1, 2, 3, 100])
 def test_a_range_is_covered_once_in_contiguous_parts(size):
-    def count(start: int, stop: int, visits: np.ndarray) -> None:
+    def count(start: int, stop: int, visits: np.ndarray, lengths: list[int]) -> None:
         visits[start:stop] += 1
+        lengths.append(stop - start)
 
     for threads in (1, 2, 5):
         torch.set_num_threads(threads)
-        visits = np.zeros(size, np.int64)
-        over_range(size, count, visits)
-        assert (visits == 1).all()
+        for least in (1, 4):
+            visits, lengths = np.zeros(size, np.int64), []
+            over_range(size, count, visits, lengths, least=least)
+            assert (visits == 1).all() and len(lengths) == min(threads, max(size // least, 1))
 
 
 @pytest.mark.usefixtures("threads")
