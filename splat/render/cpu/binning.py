@@ -13,7 +13,7 @@ from splat.backend.cpu.jit import kernel
 from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, gather, scatter, scatter_one, scratch, store_all
 from splat.backend.cpu.simd import broadcast, iota, lanes, lanes_of, load_all, prefetch, select
 from splat.backend.cpu.threads import LIGHT, over_range
-from splat.render.cpu.tile import Lists, grid_of
+from splat.render.cpu.tile import GROUP, Lists, grid_of
 from splat.render.formulas import SPLAT, Thresholds, box_of, ellipse_of, rows_of_strip
 
 DIGITS = 3
@@ -193,6 +193,6 @@ def reached_lists(lists: Lists, reached: np.ndarray, n: int) -> tuple[Lists, np.
 
 
 def heaviest_first(work: np.ndarray, columns: int) -> np.ndarray:
-    """First tiles of pairs, row by row; rows with the most work first, so that threads finish together."""
+    """First tiles of groups, row by row; rows with the most work first, so that threads finish together."""
     rows = np.argsort(-work.reshape(-1, columns).sum(1), kind="stable")
-    return (rows[:, None] * columns + np.arange(0, columns, 2)).reshape(-1)
+    return (rows[:, None] * columns + np.arange(0, columns, GROUP)).reshape(-1)

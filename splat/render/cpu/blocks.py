@@ -53,7 +53,7 @@ def block_moments(counter, params, lists, frame, pixels, v_planes, curvature, su
     L = lanes(params)
     state = scratch(params, BLOCK * L * TILE_ROWS)
     shared = scratch(params, 5 * L * TILE_ROWS)  # a row: w, w where the cap does not hold, D (3)
-    tile = next_tile(counter, lists, -1)
+    tile = next_tile(counter, lists, frame, -1)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
@@ -72,7 +72,7 @@ def block_moments(counter, params, lists, frame, pixels, v_planes, curvature, su
             for line in range(0, BLOCK_SUMS, 16):
                 prefetch(sums, np.int64(lists.accumulator[later]) * BLOCK_SUMS + line)
             block_of(params, lists, first + k, k, x0, y0, frame, state, shared, sums)
-        tile = next_tile(counter, lists, tile)
+        tile = next_tile(counter, lists, frame, tile)
 
 
 @formula

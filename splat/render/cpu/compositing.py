@@ -60,7 +60,7 @@ def forward(counter, params, lists, frame, pixels):
     """Render: fill `pixels` with colour, alpha, the final T and the number of the splat that stops each pixel."""
     L = lanes(params)
     state = scratch(params, FORWARD * L * TILE_ROWS)
-    tile = next_tile(counter, lists, -1)
+    tile = next_tile(counter, lists, frame, -1)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         # nothing in front yet: T = 1, black, and no pixel has stopped but those beyond the image
@@ -85,7 +85,7 @@ def forward(counter, params, lists, frame, pixels):
             end_row(state, FORWARD * L * y, L, frame, pixels, row_at(corner, y, frame), kept_at(tile, y, L))
         store(state, 0, furthest)
         pixels.reached[tile] = np.int64(state[:L].max())
-        tile = next_tile(counter, lists, tile)
+        tile = next_tile(counter, lists, frame, tile)
 
 
 @formula
@@ -138,7 +138,7 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
     """
     L = lanes(params)
     state = scratch(params, BACKWARD * L * TILE_ROWS)
-    tile = next_tile(counter, lists, -1)
+    tile = next_tile(counter, lists, frame, -1)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
@@ -158,7 +158,7 @@ def backward(counter, params, lists, frame, pixels, v_planes, sums):
             prefetch(params, np.int64(lists.splat[later]) * PARAMS)
             prefetch(sums, np.int64(lists.accumulator[later]) * SPLAT)
             differentiate(params, lists, first + k, k, x0, y0, frame, state, sums)
-        tile = next_tile(counter, lists, tile)
+        tile = next_tile(counter, lists, frame, tile)
 
 
 @formula

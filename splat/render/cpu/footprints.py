@@ -73,7 +73,7 @@ def find_footprints(counter, params, lists, frame, pixels, footprints, begin, en
     """w and D (rows, FOOTPRINT vectors) of the accumulators begin .. end - 1."""
     L = lanes(params)
     state = scratch(params, UNDO * L * TILE_ROWS)
-    tile = next_tile(counter, lists, -1)
+    tile = next_tile(counter, lists, frame, -1)
     while tile >= 0:
         x0, y0, _corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
@@ -85,7 +85,7 @@ def find_footprints(counter, params, lists, frame, pixels, footprints, begin, en
             if begin <= a < end:
                 at = (footprints.place[a] - footprints.place[begin]) * FOOTPRINT * L
             footprint_of(params, lists, first + k, k, x0, y0, frame, state, found, at)
-        tile = next_tile(counter, lists, tile)
+        tile = next_tile(counter, lists, frame, tile)
 
 
 @formula
@@ -110,7 +110,7 @@ def find_neighbours(counter, params, lists, frame, pixels, covered, before):
     that shares one of these pixels, or -1."""
     L = lanes(params)
     state, row = scratch(params, 2 * L * TILE_ROWS), scratch(params, L)  # state: stop, last intersection with weight
-    tile = next_tile(counter, lists, -1)
+    tile = next_tile(counter, lists, frame, -1)
     while tile >= 0:
         x0, y0, _corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
@@ -121,7 +121,7 @@ def find_neighbours(counter, params, lists, frame, pixels, covered, before):
             e = first + k
             covered[e], nearest = neighbours_of(params, lists, e, k, x0, y0, frame, state, row)
             before[e] = lists.splat[first + nearest] if nearest >= 0 else -1
-        tile = next_tile(counter, lists, tile)
+        tile = next_tile(counter, lists, frame, tile)
 
 
 @formula

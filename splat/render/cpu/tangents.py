@@ -65,7 +65,7 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
     width = (2 + TANGENT * K) * L
     state = scratch(params, width * TILE_ROWS)
     shared = scratch(params, 3 * L * TILE_ROWS)  # a row: alpha, w, w where the cap does not hold
-    tile = next_tile(counter, lists, -1)
+    tile = next_tile(counter, lists, frame, -1)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
@@ -87,7 +87,7 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
             p, kept = row_at(corner, y, frame), kept_at(tile, y, L)
             for i in range(K):
                 end_tangent_row(state, width * y + (2 + TANGENT * i) * L, L, frame, planes, transmittances, i, p, kept)
-        tile = next_tile(counter, lists, tile)
+        tile = next_tile(counter, lists, frame, tile)
 
 
 @formula
@@ -161,7 +161,7 @@ def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, 
     width = (BACKWARD + BACKWARD_TANGENT * K) * L
     state = scratch(params, width * TILE_ROWS)
     shared = scratch(params, 4 * L * TILE_ROWS)  # a row: w, beta, r R, and alpha without the cap
-    tile = next_tile(counter, lists, -1)
+    tile = next_tile(counter, lists, frame, -1)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
@@ -186,7 +186,7 @@ def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, 
                 backward_tangent_single(params, tangents, lists, first + k, k, x0, y0, frame, state, sums)
             else:
                 backward_tangent_block(params, tangents, K, lists, first + k, k, x0, y0, frame, state, shared, sums)
-        tile = next_tile(counter, lists, tile)
+        tile = next_tile(counter, lists, frame, tile)
 
 
 @formula

@@ -4,7 +4,7 @@ A vector of pixels is `lanes` / PIXEL_ROWS wide and PIXEL_ROWS high, as few spla
 TILE_ROWS vectors, one below the other; the kernels call each a row.  An intersection is a splat in a tile.  Each writes
 its nine sums (six moments of s, three of colour: `render/formulas.py`) to an accumulator of its own, and those of a splat lie
 side by side, so that no sum depends on the order in which threads finish.  Every kernel (`compositing.py`, `tangents.py`,
-`blocks.py`) takes pairs of tiles from a counter until none is left (`threads.over_tiles`).  Arrays are flat: `params` holds
+`blocks.py`) takes groups of tiles from a counter until none is left (`threads.over_tiles`).  Arrays are flat: `params` holds
 PARAMS floats a splat, `tangents` K x SPLAT floats a splat, a plane stride x height floats.
 """
 
@@ -23,6 +23,7 @@ from splat.backend.cpu.memory import (
     store_pixels,
 )
 from splat.backend.cpu.simd import (
+    REGISTER_BITS,
     any_lane,
     broadcast,
     fetch_and_increment,
@@ -36,6 +37,7 @@ from splat.backend.cpu.simd import (
 )
 from splat.render.formulas import SPLAT, along_row, alpha_row, column_terms, reciprocal, row_terms
 
+GROUP = 1024 // REGISTER_BITS  # tiles whose rows share a cache line
 AHEAD = 6  # intersections between a prefetch and its use
 
 # A splat's numbers, one cache line in float32: in float64 its mean x, y (pixel index units) and the whitening's shear; then the
@@ -58,7 +60,7 @@ class Lists(NamedTuple):
 
     start: (tiles + 1,) first intersection of each tile; splat: (intersections,); rows: (intersections,) first row |
     last row << 8 within the tile; accumulator: (intersections,) where their sums go, splat by splat;
-    order: the first tiles of pairs, as pairs are handed out.
+    order: the first tiles of groups, as these are handed out.
     """
 
     start: np.ndarray
@@ -106,12 +108,12 @@ class Pixels(NamedTuple):
 
 
 @formula
-def next_tile(counter, lists, tile):
-    """The tile after a thread's last one (-1 before the first): the other of its pair, or the next pair's first; -1 at the end.
+def next_tile(counter, lists, frame, tile):
+    """The tile after a thread's last one (at first -1): the next of its group, or another group's first; -1 at the end.
 
-    The tiles of a pair share the cache lines of their rows: two threads that write to one line wait for each other.
+    The tiles of a group share the cache lines of their rows: two threads that write to one line wait for each other.
     """
-    if tile & 1 == 0:
+    if (tile + 1) % frame.columns % GROUP != 0:
         return tile + 1
     turn = fetch_and_increment(counter)
     return lists.order[turn] if turn < lists.order.size else np.int64(-1)
@@ -120,7 +122,8 @@ def next_tile(counter, lists, tile):
 @formula
 def next_corner(counter, lists, tile, lanes, frame):
     """Index in a plane of the first pixel of the tile after this one, unless another thread takes that."""
-    following = tile + 1 if tile & 1 == 0 else lists.order[min(counter[0], lists.order.size - 1)]
+    begins = (tile + 1) % frame.columns % GROUP == 0
+    following = lists.order[min(counter[0], lists.order.size - 1)] if begins else tile + 1
     return corner_of(following, lanes, frame.columns, frame.stride)[2]
 
 

@@ -8,7 +8,6 @@ from splat.backend.cpu.jit import kernel
 from splat.backend.cpu.memory import PIXEL_ROWS, TILE_ROWS
 from splat.backend.cpu.simd import lanes_of
 from splat.model.settings import RenderSettings
-from splat.render.cpu import binning
 from splat.render.cpu.binning import bin_splats, depth_order, heaviest_first, radix_argsort
 from splat.render.cpu.tile import next_tile
 from splat.render.formulas import thresholds_of
@@ -35,15 +34,15 @@ def test_the_radix_sort_orders_every_bit(highest):
 
 
 def test_the_radix_sort_reads_the_bits_by_which_depths_differ(monkeypatch):
-    bits = []
-    monkeypatch.setattr(binning, "radix_argsort", lambda keys, index, width: bits.append(width) or index)
+    bits, sort = [], "splat.render.cpu.binning.radix_argsort"
+    monkeypatch.setattr(sort, lambda keys, index, width: bits.append(width) or index)
     for depths in ([3.0], [1.0, 1.5, 1.25], [0.01, 1e6]):
         depth_order(np.array(depths, np.float32), np.ones(len(depths), bool))
     assert bits == [0, 8, 10]
 
 
-def test_the_heaviest_row_of_tiles_comes_first_in_pairs():
-    assert heaviest_first(np.array([3, 1, 5, 1, 9, 0, 2, 6]), 4).tolist() == [4, 6, 0, 2]
+def test_the_heaviest_row_of_tiles_comes_first():
+    assert heaviest_first(np.array([3, 1, 9, 0, 2, 6]), 2).tolist() == [2, 4, 0]
 
 
 def test_a_faint_splat_whose_determinant_rounds_to_zero_is_in_no_tile():
@@ -99,20 +98,21 @@ def test_vectors_of_two_rows_of_pixels_hold_fewer_pixels_outside_of_small_splats
 
 
 @kernel
-def tiles_taken(counter, lists, taken):
+def tiles_taken(counter, lists, frame, taken):
     for k in range(taken.size):
-        taken[k] = next_tile(counter, lists, taken[k - 1] if k else -1)
+        taken[k] = next_tile(counter, lists, frame, taken[k - 1] if k else -1)
 
 
-def test_a_thread_takes_the_tiles_of_a_pair_one_after_the_other_and_all_once():
+def test_a_thread_takes_the_tiles_of_a_cache_line_one_after_the_other_and_all_once():
     raster = truth("typical").raster(DTYPES[0])
+    columns, line = raster.frame.columns, 64 // (4 * lanes_of(np.float32) // PIXEL_ROWS)
     for lists in (raster.lists, raster.reached[0]):
         taken = np.empty(lists.start.size - 1, np.int64)
-        tiles_taken(np.zeros(1, np.int64), lists, taken)
-        assert (taken[::2] % 2 == 0).all() and (taken[1::2] == taken[::2] + 1).all()
+        tiles_taken(np.zeros(1, np.int64), lists, raster.frame, taken)
         assert sorted(taken) == list(range(taken.size))
-        tiles_taken(np.ones(1, np.int64), lists, taken)  # another thread has taken a pair
-        assert (taken[-2:] == -1).all() and (taken[:-2] >= 0).all()
+        assert all(taken[k] == taken[k - 1] + 1 for k in range(1, taken.size) if taken[k] % columns % line)
+        tiles_taken(np.ones(1, np.int64), lists, raster.frame, taken)  # another thread has taken a group
+        assert (taken[-min(line, columns) :] == -1).all() and (taken[: -min(line, columns)] >= 0).all()
 
 
 def test_entries_that_no_pixel_reaches_are_dropped_and_the_others_numbered_splat_by_splat():
