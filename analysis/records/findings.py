@@ -52,7 +52,7 @@ def findings(data: ProbeRecord) -> list[Line]:
         *of_budgets({"max": ends.max.reason, "min": ends.min.reason}),
         *_of_open(data),
         *of_slice(data.slice, data.provenance),
-        *(Line(_sentence(note), "caution") for note in data.notes),
+        *(Line(note[:1].upper() + note[1:] + "." * (note[-1:] not in ".!?"), "caution") for note in data.notes),
     ]
     return sorted(lines, key=lambda line: line.level != "failure")
 
@@ -269,10 +269,6 @@ def unresolved(plane: schema.Slice, made: Provenance) -> str:
         f"Between its two sections the plane is not known{accuracy} from {plane.evaluated_points:,} of "
         f"{plane.points:,} renders, and no surface is drawn; {made.other_command('slice')} renders more."
     )
-
-
-def _sentence(note: str) -> str:
-    return f"{note[:1].upper()}{note[1:]}" + ("" if note.endswith((".", "!", "?")) else ".")
 
 
 def _is_finite(number: schema.Number) -> TypeGuard[float]:

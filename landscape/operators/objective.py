@@ -93,7 +93,8 @@ class ObjectiveHessian:
             self.value += value
             self._gradient += self._flat(gradient).detach()
             if kept == number and (not kept or _free_memory(self._device) > enough):
-                self._kept, kept = _sum(self._kept, gradient) if kept else gradient, kept + 1
+                pairs = zip(self._kept if kept else [None] * len(gradient), gradient, strict=True)
+                self._kept, kept = [b if a is None else a if b is None else a + b for a, b in pairs], kept + 1
         self._anew = terms[kept:]
         require_hessian(self, self._gradient_at, center, self._gradient)
 
@@ -214,11 +215,6 @@ class ObjectiveHessian:
         if any(part is not None and part.layout != torch.strided for part in gradient):
             raise InputError("expected dense gradients, got a sparse one; take nn.Embedding(sparse=False)")
         return float(value.detach()), gradient
-
-
-def _sum(one: list[Tensor | None], other: list[Tensor | None]) -> list[Tensor | None]:
-    """Sums of gradients, None where there is none."""
-    return [b if a is None else a if b is None else a + b for a, b in zip(one, other, strict=True)]
 
 
 def _require_one_kind(parts: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -37,6 +37,7 @@ class Store(Protocol):
 
 
 SAVE_EVERY = 5.0  # seconds
+PART = 1 << 15  # parameters that are moved at a time: their numbers stay in a processor's cache
 SAME_LOSS = 100.0  # units of round-off by which two evaluations at one point may differ, summed in different orders
 
 
@@ -66,7 +67,7 @@ class GridEvaluations:
         progress: Progress | None = None,
     ):
         self._loss, self._center, self._points = loss, center.detach(), points.to(center.device)
-        self._origin, self._spans = self._center.double(), directions.detach().double()
+        self._directions = directions.detach().T.contiguous()
         self._workers, self._store, self._progress = workers, store, progress
         self.center_loss, self._here = evaluated_at(loss, self._center)
         if not isfinite(self.center_loss):
@@ -107,7 +108,14 @@ class GridEvaluations:
             pool.shutdown(cancel_futures=True)
 
     def _at(self, point: int) -> tuple[float, Hashable]:
-        theta = (self._origin + self._spans @ self._points[point]).to(self._center.dtype)
+        theta, steps = torch.empty_like(self._center), self._points[point].tolist()
+        size = PART if theta.device.type == "cpu" else len(theta)
+        each = (array.split(size) for array in (theta, self._center, *self._directions))
+        for part, origin, *directions in zip(*each, strict=True):
+            exact = origin.to(torch.float64, copy=True)
+            for direction, step in zip(directions, steps, strict=True):
+                exact.add_(direction, alpha=step)
+            part.copy_(exact)
         return evaluated_at(self._loss, theta)
 
     def _set(self, point: int, value: float, discontinuous: bool) -> None:

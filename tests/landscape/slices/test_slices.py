@@ -22,12 +22,12 @@ def quadratic(theta):
     return 7 + G @ step + step @ A @ step / 2
 
 
-def test_the_slice_of_a_quadratic_is_its_model():
+def test_the_slice_of_a_quadratic_is_its_model(monkeypatch):
+    monkeypatch.setattr("landscape.slices.grid_evaluations.PART", 4)  # parameters are moved in three parts
     directions = torch.stack([EIGENVECTORS[:, -1], EIGENVECTORS[:, 0] + EIGENVECTORS[:, 3]], dim=1)
     result = evaluate_slice(quadratic, CENTER, directions, AXES, gradient=G, operator=DenseOperator(A), settings=ALL)
     assert result.loss.shape == (5, 3) and result.center_loss == 7 and result.evaluations == 16
-    assert result.evaluated.all()
-    assert result.reason == "exact" and result.interpolation_error == 0
+    assert result.evaluated.all() and result.reason == "exact" and result.interpolation_error == 0
     assert result.model is not None and (result.loss - result.model).abs().max() < 1e-13
     assert result.slope is not None and torch.allclose(result.slope, directions.T @ G, rtol=0, atol=1e-14)
     assert result.curvature is not None
