@@ -122,8 +122,7 @@ def next_tile(counter, lists, frame, tile):
 @formula
 def next_corner(counter, lists, tile, lanes, frame):
     """Index in a plane of the first pixel of the tile after this one, unless another thread takes that."""
-    begins = (tile + 1) % frame.columns % GROUP == 0
-    following = lists.order[min(counter[0], lists.order.size - 1)] if begins else tile + 1
+    following = tile + 1 if (tile + 1) % frame.columns % GROUP else lists.order[min(counter[0], lists.order.size - 1)]
     return corner_of(following, lanes, frame.columns, frame.stride)[2]
 
 
