@@ -2,10 +2,7 @@ import pytest
 import torch
 
 from landscape.probes import draw_probes, spawn
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
+from tests.landscape.spectra import generator
 
 
 @pytest.mark.parametrize("distribution", ["rademacher", "gaussian"])

@@ -8,7 +8,7 @@ from landscape.linalg import gram
 from landscape.operators.operator import CountingOperator, DenseOperator
 from landscape.traces.diagonal import estimate_diagonal
 from notebooks.accuracy.sketched_diagonal import _Small, chosen_diagonal, sketched_samples
-from tests.landscape.spectra import generator
+from tests.landscape.spectra import Buffered, generator
 from tests.oracles import symmetric_matrix
 
 N = 80
@@ -98,6 +98,24 @@ def test_the_same_seed_gives_the_same_numbers_in_batches_of_any_size(matrix):
     assert torch.equal(one, same) and torch.allclose(one, other, rtol=0, atol=1e-12)
 
 
+def test_single_precision_products_give_the_diagonal_to_single_precision():
+    found = chosen_diagonal(DenseOperator(LOW.float()), generator(), 32)
+    error = float((found.values - LOW.diagonal()).abs().max())
+    assert found.method == "sketch" and error < N * torch.finfo(torch.float32).eps * float(LOW.norm())
+
+
+def test_products_that_are_not_finite_are_refused():
+    class Late(DenseOperator):
+        calls = 0
+
+        def apply(self, V):
+            self.calls += 1
+            return super().apply(V) / (self.calls <= 4)
+
+    with pytest.raises(ValueError, match="expected finite products H V"):
+        chosen_diagonal(Late(POWER), generator(), 32)  # the sketch's own products, after four of four probes
+
+
 def test_the_samples_have_the_mean_and_no_less_than_their_spread():
     Z, Y, Q, HQ = sketch(POWER, 12)
     plain = _Small.of(gram(Q, Y), gram(Q, Z), gram(Q, HQ)).samples(Z, Q, HQ)
@@ -105,3 +123,10 @@ def test_the_samples_have_the_mean_and_no_less_than_their_spread():
     assert torch.allclose(samples.mean(dim=1), plain.mean(dim=1), rtol=0, atol=1e-12)
     ratios = samples.std(dim=1) / plain.std(dim=1)
     assert float(ratios.min()) >= 1 - 1e-12 and torch.allclose(ratios, ratios[0].expand(N), rtol=1e-9)
+
+
+def test_an_operator_may_give_the_same_memory_at_every_call():
+    matrix = torch.from_numpy(symmetric_matrix(1 / np.arange(1, 121.0) ** 1.5, seed=1))
+    plain, buffered = (chosen_diagonal(H, generator(), 32) for H in (DenseOperator(matrix), Buffered(matrix)))
+    assert plain.method == buffered.method == "sketch"
+    assert torch.allclose(plain.values, buffered.values, rtol=1e-9)

@@ -4,6 +4,7 @@ import torch
 
 from landscape.operators.checks import check_operator
 from landscape.operators.operator import CountingOperator, DenseOperator
+from tests.landscape.spectra import generator
 from tests.oracles import symmetric_matrix
 from tests.refusals import misused
 
@@ -19,10 +20,6 @@ class Any:
 
     def apply(self, V):
         return self.function(V)
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -7,6 +7,7 @@ from torch import Tensor
 from landscape import gauss_newton_blocks, gauss_newton_traces
 from landscape.operators.renderer import RendererHessian
 from tests.landscape.foreign import Bumps
+from tests.landscape.spectra import generator
 from tests.refusals import refused
 
 
@@ -22,10 +23,6 @@ def bridge(kind: str) -> tuple[RendererHessian, Tensor]:
     bumps = Bumps()
     H = RendererHessian(bumps.render, bumps.named, LOSSES[kind], bumps.views)
     return H, H.gauss_newton.apply(torch.eye(24, dtype=torch.float64))
-
-
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 @pytest.mark.parametrize("kind", LOSSES)

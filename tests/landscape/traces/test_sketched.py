@@ -12,7 +12,7 @@ from landscape.traces.choice import chosen
 from landscape.traces.hutchinson import TraceSettings
 from landscape.traces.sketched import _leave_out, hutch_plus_plus, xtrace
 from landscape.traces.trace import estimate_traces
-from tests.landscape.spectra import generator
+from tests.landscape.spectra import Broken, generator
 from tests.oracles import symmetric_matrix
 
 N = 120
@@ -175,9 +175,5 @@ def test_the_error_of_xtrace_counts_that_the_test_vectors_share_a_sketch():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_products_that_are_not_finite_are_an_error_that_names_the_block(method):
-    class Broken(DenseOperator):
-        def apply(self, V):
-            return super().apply(V) / 0
-
     with pytest.raises(ValueError, match=r"expected finite products H V.*in all"):
         estimate_traces(Broken(INDEFINITE), generator(), TraceSettings.fixed(30, method=method))

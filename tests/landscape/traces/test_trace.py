@@ -7,7 +7,7 @@ import torch
 
 from landscape.operators.operator import CountingOperator, DenseOperator
 from landscape.traces.trace import PAPER, TraceSettings, estimate_traces
-from tests.landscape.spectra import Buffered
+from tests.landscape.spectra import Broken, Buffered, generator
 from tests.oracles import symmetric_matrix
 from tests.refusals import misused, refused
 
@@ -17,10 +17,6 @@ INDEFINITE = torch.from_numpy(symmetric_matrix(np.linspace(-0.5, 1, N), seed=0))
 POSITIVE = torch.from_numpy(symmetric_matrix(np.linspace(0.2, 1, N), seed=1))
 READINGS = ["block", "full"]
 DISTRIBUTIONS = ["rademacher", "gaussian"]
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def exact(matrix):
@@ -145,10 +141,6 @@ def test_progress_never_falls_and_ends_at_the_budget(reading):
 
 
 def test_products_that_are_not_finite_are_an_error_that_names_the_block():
-    class Broken(DenseOperator):
-        def apply(self, V):
-            return super().apply(V) / 0
-
     misused(r"expected finite products H V.*in a", estimate_traces, Broken(INDEFINITE, BLOCKS), generator())
 
 
