@@ -86,14 +86,14 @@ class ObjectiveHessian:
         self._shapes, self._terms = {name: part.shape for name, part in parts.items()}, terms
         self._point = self._leaves(center.clone())
         self.value, self._gradient = 0.0, torch.zeros_like(center)
-        self._kept: list[Tensor | None] = []  # the gradient of the first terms in each part, with its graph
+        self._kept: list[Tensor | None] = [None] * len(parts)  # the gradient of the first terms, with its graph
         enough, kept = _free_memory(self._device) / 2, 0
         for number, term in enumerate(terms):
             value, gradient = self._at(self._point, term, create_graph=True)
             self.value += value
             self._gradient += self._flat(gradient).detach()
             if kept == number and (not kept or _free_memory(self._device) > enough):
-                pairs = zip(self._kept if kept else [None] * len(gradient), gradient, strict=True)
+                pairs = zip(self._kept, gradient, strict=True)
                 self._kept, kept = [b if a is None else a if b is None else a + b for a, b in pairs], kept + 1
         self._anew = terms[kept:]
         require_hessian(self, self._gradient_at, center, self._gradient)
