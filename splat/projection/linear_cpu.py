@@ -19,7 +19,8 @@ from torch import Tensor
 
 from splat.backend.cpu.dual import DIRECTIONS, tangent_of, value_of, variable
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.simd import store
+from splat.backend.cpu.memory import scratch
+from splat.backend.cpu.simd import lanes, load, store
 from splat.backend.cpu.threads import over_range
 from splat.model.gaussians import Gaussians, attribute_shapes
 from splat.projection.antialias import antialiased_adjoint, antialiased_geometry
@@ -39,6 +40,7 @@ from splat.projection.whitening import cancellation, geometry_coefficients, plai
 
 LEAST_CANCELLATION = 4.0  # `cancellation` above which tangents take double precision
 FEW = 64  # Gaussians that `affects` tests before it tests all
+ROW = 16  # numbers of a row of J in `chain_blocks`: GEOMETRY, the logit, and zeros to whole vectors
 
 
 @formula
@@ -294,39 +296,49 @@ def pull_back(
                 out_quats[i, j, k] += h[6 + j]
 
 
+@formula
+def weigh_rows(weights, step, first, rows, out, to):
+    """Write sum_s weights[step s + first] rows[s] over the rows (9, ROW), flat, to out from `to` on."""
+    L = lanes(rows)
+    for at in range(0, ROW, L):
+        total = load(rows, at) * weights[first]
+        for s in range(1, 9):
+            total += load(rows, s * ROW + at) * weights[step * s + first]
+        store(out, to + at, total)
+
+
 @kernel
 def chain_blocks(start, stop, jac, blocks, second_order, geometry_out, sh_out):
     """Write P'^T B P' for diagonal blocks B (m, 9, 9) of splats, plus (a . P'') where second_order.
 
     geometry_out: (n, 11, 11) over mean, log-scales, quaternion and opacity logit.  sh_out: (n, bands, 3), the diagonal for SH.
     """
-    bands = sh_out.shape[1]
-    J, product = np.zeros((9, GEOMETRY + 1)), np.zeros(9)
+    bands, doubles = sh_out.shape[1], np.zeros(0)
+    J, product, row = scratch(doubles, 9 * ROW), scratch(doubles, 9 * ROW), scratch(doubles, ROW)
+    J[:] = 0
     for e in range(start, stop):
         i = jac.index[e]
-        # J: the rows of P' over geometry and logit, one for each of the splat's nine numbers
-        J[0, GEOMETRY] = jac.logit_slope[e]
-        J[1:6, :GEOMETRY] = jac.jacobian[e]
+        # J: the rows of P' over geometry and logit, one for each of the splat's nine numbers, and zeros behind
+        J[GEOMETRY] = jac.logit_slope[e]
+        for r in range(5):
+            for j in range(GEOMETRY):
+                J[(1 + r) * ROW + j] = jac.jacobian[e, r, j]
         for j in range(jac.opacity_slope.shape[1]):
-            J[0, j] = jac.opacity_slope[e, j]
+            J[j] = jac.opacity_slope[e, j]
         for c in range(3):
             for j in range(3):
-                J[6 + c, j] = jac.visible[e, c] * jac.colour_slope[e, c, j]
+                J[(6 + c) * ROW + j] = jac.visible[e, c] * jac.colour_slope[e, c, j]
             for b in range(bands):
                 sh_out[i, b, c] = jac.visible[e, c] * jac.harmonic[e, b] * jac.harmonic[e, b] * blocks[e, 6 + c, 6 + c]
-        # J^T B J, column by column
+        # B J, then J^T B J, row by row
+        for r in range(9):
+            weigh_rows(blocks[e, r], 1, 0, J, product, r * ROW)
         for j in range(GEOMETRY + 1):
-            for r in range(9):
-                product[r] = 0
-                for s in range(9):
-                    product[r] += blocks[e, r, s] * J[s, j]
+            weigh_rows(J, ROW, j, product, row, 0)
             for k in range(j + 1):
-                total = 0.0
-                for r in range(9):
-                    total += J[r, k] * product[r]
                 if second_order and j < GEOMETRY:
-                    total += jac.curvature[e, j * (j + 1) // 2 + k]
-                geometry_out[i, j, k] = geometry_out[i, k, j] = total
+                    row[k] += jac.curvature[e, j * (j + 1) // 2 + k]
+                geometry_out[i, j, k] = geometry_out[i, k, j] = row[k]
         # (a . P'') of the logit, and of the logit with the geometry
         if second_order:
             geometry_out[i, GEOMETRY, GEOMETRY] += jac.logit_curvature[e]

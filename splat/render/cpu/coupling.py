@@ -8,236 +8,214 @@ image, with S'' (3, 3) at the window's centre (`losses/formulas.py`), r the resi
 A splat changes a channel by the slopes d = D, D u, D v, D u^2, D u v, D v^2 in the coefficients Q0, QU, ... of q', and d = w in
 its colour (w and D: `footprints.py`; u, v: whitened offset).  Its block has M . S'' M' for every pair of these SLOPES.
 
-The blur is separable, and u depends on the column alone.  So D f, D f v, D f v^2 and w f, for the factors f = 1, 2 r and y - c,
-are blurred down the columns first, and then along the rows, where u(x + t) = u(x) + t `along` gives the slopes with u:
+The offsets are linear in the pixel: u(x + t) = u(x) + a t for t columns, and v is more by e t, e = a r, and by b s for s rows.
+So the slopes' M are those of D's moments in a window, times powers of u and v at its centre:
 
-    blur(u F) = u B_0 + along B_1       blur(u^2 F) = u^2 B_0 + 2 u along B_1 + along^2 B_2       B_j = sum_t t^j g_t F(x + t)
+    B_ij = sum over t, s of (a t)^i (b s)^j g_t g_s F(x + t, y + s),  i + j <= 2,      F = f D,  f = 1, 2 r, y - c
+    blur(u F) = u B_00 + B_10             blur(u^2 F) = u^2 B_00 + 2 u B_10 + B_20
+    blur(v F) = v B_00 + r B_10 + B_01    and so on (`slopes_of`)
 
-A ring buffer holds the last RING rows of a splat's fields; their columns count from the first window that reaches one of its
-pixels.  Sums are moved to double precision every FLUSH rows.  Three tuples go through the functions:
+The blur is separable: each row of a splat's fields F and f w is blurred along itself with the powers of a t, and these down the
+columns with those of b s, a strip of windows, `lanes` wide, at a time.  Rows without weight are left out.  Sums are moved to
+double precision every FLUSH rows.  Three tuples go through the functions:
 
     footprints   (layout, begin, values): `Footprints`, and w and D of the accumulators from begin on (`find_footprints`)
     planes       (image, target, seconds, index of the channel's first pixel): of `losses.cpu.loss.Coupling`
-    work         (ring, rows, corners, spans, moved, sums): ring buffer; a row blurred down the columns; first pixel (row,
-                 column) of each of the splat's tiles; its first and last column in each row; M of each slope; sums by lane
+    work         (fields, rows, taps, spans, sums): the fields of a splat's box; a strip of them, blurred along its rows;
+                 g_s (b s)^j; the splat's first and last column in each row; sums by lane
 """
 
 import numpy as np
 import torch
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, TILE_ROWS, load_pixels, scratch, store_pixels
-from splat.backend.cpu.simd import broadcast, fetch_and_increment, iota, lanes, load, store, store_sums
+from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, load_pixels, scratch, store_pixels
+from splat.backend.cpu.simd import (
+    broadcast,
+    fetch_and_increment,
+    fma,
+    iota,
+    lanes,
+    load,
+    load_all,
+    load_double,
+    prefetch,
+    store,
+    store_sums,
+)
 from splat.losses.cpu.window import both_ways, weighted
 from splat.losses.formulas import CENTRE, ssim_second_dot
-from splat.losses.reference import REACH, window
+from splat.losses.reference import REACH, WINDOW, window
 from splat.render.cpu.footprints import FOOTPRINT
-from splat.render.cpu.tile import ALONG, PARAMS, alpha_terms, column_u, row_range
+from splat.render.cpu.tile import ACROSS, ALONG, MX, MY, PARAMS, SHEAR, STEP, column_u, row_range
 
 FACTORS = 3  # f: 1, 2 r, y - c
-POWERS = 4  # fields of each factor: D, D v, D v^2, w
-FIELDS = FACTORS * POWERS
+FIELDS = 2 * FACTORS  # f D and f w
+BLURRED = 4 * FACTORS  # along a row: f D with the powers 0, 1, 2 of a t, and f w
 SLOPES = 7  # of a channel in a splat's numbers, in the order of its block: six of geometry, one of colour
 PAIRS = SLOPES * (SLOPES + 1) // 2
-TOGETHER = 4  # rows of windows that are blurred in one go
-RING = 16  # rows: a power of two, at least the window's 2 REACH and TOGETHER
+AHEAD = 3  # rows between a prefetch and its use
 EDGE = 16  # floats of padding at either side of a row: at least a vector, and REACH
 FLUSH = 16  # rows
 TAPS = tuple(float(tap) for tap in window(torch.float64)[REACH:])
-# taps of B_1 and B_2, without the middle ones, which are 0
+# taps with the powers 1 and 2 of t, without the middle ones, which are 0
 FIRST, SECOND = (tuple(k**power * tap for k, tap in enumerate(TAPS) if k) for power in (1, 2))
 
 
 @kernel
-def coupled_blocks(counter, index, params, frame, footprints, image, target, seconds, blocks):
-    """Add sum M . S'' M' to the blocks (m, 9, 9) of the splats at index, largest first: threads then end at the same time."""
-    L = lanes(params)
-    widest = FIELDS * (frame.stride + 2 * EDGE)
-    ring, rows = scratch(params, RING * widest), scratch(params, TOGETHER * widest)
-    spans, weights = np.empty((frame.size // frame.stride, 2), np.int64), scratch(params, L)
-    corners = np.empty((frame.size // (TILE_ROWS * L), 2), np.int64)
-    moved, sums, total = scratch(params, FACTORS * SLOPES * L), scratch(params, PAIRS * L), np.empty(PAIRS)
-    part = np.empty(PAIRS, params.dtype)
-    # a splat a turn, the largest first
+def coupled_blocks(counter, order, index, params, frame, footprints, image, target, seconds, weight, blocks):
+    """Add weight times sum M . S'' M' to the blocks (m, 9, 9) of the splats at index; order: of its elements, those to do."""
+    L, height = lanes(params), frame.size // frame.stride
+    fields = scratch(params, FIELDS * height * (frame.stride + 2 * EDGE))
+    rows, taps = scratch(params, BLURRED * height * L), scratch(params, 3 * WINDOW * L)
+    spans, weights = np.empty((height, 2), np.int64), scratch(params, L)
+    sums, part, total = scratch(params, PAIRS * L), np.empty(PAIRS, params.dtype), np.empty(PAIRS)
+    work = (fields, rows, taps, spans, sums)
+    # a splat a turn
     turn = fetch_and_increment(counter)
-    while turn < index.size:
-        splat = index[turn]
-        y0, y1 = find_spans(params, splat, frame, footprints, corners, spans, weights)
+    while turn < order.size:
+        splat = index[order[turn]]
+        y0, y1 = find_spans(splat, frame, footprints, spans, weights, L)
         if y0 <= y1:
             box = box_of_windows(spans, y0, y1, frame, L)
+            fill_taps(taps, params[splat * PARAMS + ACROSS], L)
             for channel in range(3):
                 planes = (image, target, seconds, channel * frame.size)
-                work = (ring, rows, corners, spans, moved, sums)
-                sum_windows(params, splat, channel, box, frame, footprints, planes, work, part, total)
-                add_to_block(total, channel, blocks[turn])
+                fill_fields(splat, channel, box, frame, footprints, planes, fields, L)
+                sum_windows(params, splat, box, frame, planes, work, part, total)
+                add_to_block(total, weight, channel, blocks[order[turn]])
         turn = fetch_and_increment(counter)
 
 
 @formula
-def find_spans(params, splat, frame, footprints, corners, spans, weights):
-    """First and last row in which a splat has weight; fills corners and spans (see `work`).  weights: space for a vector."""
-    L, across = lanes(params), lanes(params) // PIXEL_ROWS
+def find_spans(splat, frame, footprints, spans, weights, L):
+    """First and last row in which a splat has weight; fills spans (see `work`).  weights: space for a vector."""
     layout, begin, values = footprints
-    first, last = layout.splat_start[splat], layout.splat_start[splat + 1]
     y0, y1, done = frame.size, np.int64(-1), np.int64(0)
-    for a in range(first, last):
-        row, column = layout.tiles[a] // frame.columns * TILE_HEIGHT, layout.tiles[a] % frame.columns * across
-        corners[a - first, 0], corners[a - first, 1] = row, column
+    for a in range(layout.splat_start[splat], layout.splat_start[splat + 1]):
+        row, column = corner_of_tile(layout, a, frame, L)
         # the rows of a new row of tiles have no columns yet
         for y in range(max(row, done), row + TILE_HEIGHT):
             spans[y, 0], spans[y, 1] = frame.stride, -1
         done = row + TILE_HEIGHT
         top, bottom = row_range(layout.rows[a])
         for k in range(top, bottom):
-            store(weights, 0, load(values, (layout.place[a] - layout.place[begin] + k - top) * FOOTPRINT * L))
+            at = (layout.place[a] - layout.place[begin] + k - top) * FOOTPRINT * L
+            for vector in range(FOOTPRINT):
+                prefetch(values, at + (2 * AHEAD * FOOTPRINT + vector) * L)
+            store(weights, 0, load(values, at))
             # widen the rows' spans by the pixels with weight
             for lane in range(L):
-                x, y = column + lane % across, row + PIXEL_ROWS * k + lane // across
+                x, y = column + lane % (L // PIXEL_ROWS), row + PIXEL_ROWS * k + lane // (L // PIXEL_ROWS)
                 if weights[lane] > 0:
-                    spans[y, 0], spans[y, 1] = min(spans[y, 0], x), x
+                    spans[y, 0], spans[y, 1] = min(spans[y, 0], x), max(spans[y, 1], x)
                     y0, y1 = min(y0, y), max(y1, y)
     return y0, y1
 
 
 @formula
-def hull_of(spans, first, last):
-    """First and last column over the rows first .. last."""
-    lo, hi = spans[first, 0], spans[first, 1]
-    for y in range(first + 1, last + 1):
-        lo, hi = min(lo, spans[y, 0]), max(hi, spans[y, 1])
-    return lo, hi
+def corner_of_tile(layout, a, frame, L):
+    """Row and column of the first pixel of an accumulator's tile."""
+    tile = np.int64(layout.tiles[a])
+    return tile // frame.columns * TILE_HEIGHT, tile % frame.columns * (L // PIXEL_ROWS)
 
 
 @formula
 def box_of_windows(spans, y0, y1, frame, L):
     """First and last row of a splat, first column of its windows, and the number of vectors that their columns take."""
-    lo, hi = hull_of(spans, y0, y1)
+    lo, hi = spans[y0, 0], spans[y0, 1]
+    for y in range(y0 + 1, y1 + 1):
+        lo, hi = min(lo, spans[y, 0]), max(hi, spans[y, 1])
     left = max(lo - REACH, 0)
     vectors = (min(hi + REACH, frame.width - 1) - left) // L + 1
     return y0 - y0 % PIXEL_ROWS, y1, min(left, frame.stride - vectors * L), vectors
 
 
 @formula
-def add_to_block(total, channel, block):
-    """Add a channel's sums for pairs of slopes to a block (9, 9); the last slope is the channel's colour."""
+def fill_taps(taps, across, L):
+    """Write g_s (b s)^j in every lane, j = 0, 1, 2 side by side, for b = across."""
+    for k in range(-REACH, REACH + 1):
+        for power in range(3):
+            store(taps, (3 * (k + REACH) + power) * L, TAPS[abs(k)] * (k * across) ** power)
+
+
+@formula
+def add_to_block(total, weight, channel, block):
+    """Add weight times a channel's sums for pairs of slopes to a block (9, 9); the last slope is the channel's colour."""
     j = 0
     for a in range(SLOPES):
         for b in range(a + 1):
             row = a + channel if a == SLOPES - 1 else a
             column = b + channel if b == SLOPES - 1 else b
-            block[row, column] += total[j]
+            block[row, column] += weight * total[j]
             if a != b:
-                block[column, row] += total[j]
+                block[column, row] += weight * total[j]
             j += 1
 
 
 @formula
-def sum_windows(params, splat, channel, box, frame, footprints, planes, work, part, total):
+def fill_fields(splat, channel, box, frame, footprints, planes, fields, L):
+    """Write the fields of a splat, row by row: f D and f w of each factor, 0 where it has no weight."""
+    image, target, _seconds, top = planes
+    layout, begin, values = footprints
+    y0, y1, left, vectors = box
+    pitch = vectors * L + 2 * EDGE
+    for at in range(0, (y1 - y0 + PIXEL_ROWS) * FIELDS * pitch, L):
+        store(fields, at, 0.0)
+    for a in range(layout.splat_start[splat], layout.splat_start[splat + 1]):
+        row, x = corner_of_tile(layout, a, frame, L)
+        first, last = row_range(layout.rows[a])
+        # the part of the tile that lies in the box
+        if left - L // PIXEL_ROWS < x < left + vectors * L:
+            for y in range(max(row + PIXEL_ROWS * first, y0), min(row + PIXEL_ROWS * last, y1 + 1), PIXEL_ROWS):
+                where = (layout.place[a] - layout.place[begin] + (y - row) // PIXEL_ROWS - first) * FOOTPRINT * L
+                w, D = load(values, where), load(values, where + (1 + channel) * L)
+                p, to = top + y * frame.stride + x, (y - y0) * FIELDS * pitch + EDGE + x - left
+                photo = load_pixels(target, p, frame.stride)
+                residual, aim = 2.0 * (load_pixels(image, p, frame.stride) - photo), photo - CENTRE
+                # a row of pixels to the next one: all fields
+                store_all_pixels(fields, to, pitch, (D, w, residual * D, residual * w, aim * D, aim * w))
+
+
+@formula
+def store_all_pixels(fields, to, pitch, values):
+    """Store vectors of pixels in the fields at `to`."""
+    for k in range(len(values)):
+        store_pixels(fields, to + k * pitch, FIELDS * pitch, values[k])
+
+
+@formula
+def sum_windows(params, splat, box, frame, planes, work, part, total):
     """Write the sum of a channel's M . S'' M' over all windows to total (PAIRS,).  box: of `box_of_windows`; part: space."""
-    ring, _rows, _corners, spans, _moved, sums = work
+    fields, rows, _taps, spans, sums = work
     y0, y1, left, vectors = box
     L = lanes(params)
-    pitch = vectors * L + 2 * EDGE
+    pitch, unflushed = vectors * L + 2 * EDGE, 0
+    along = broadcast(params, params[splat * PARAMS + ALONG])
     sums[:], total[:] = 0, 0
-    for y in range(y0 - 2 * REACH, y0):  # the rows above the splat
-        clear_row(ring, y, vectors, pitch, L)
-    unflushed, a = 0, footprints[0].splat_start[splat]
-    for first in range(y0 - REACH, y1 + REACH + 1, TOGETHER):  # rows of windows' centres
-        # the rows that come into the ring
-        for ahead in range(first + REACH, first + REACH + TOGETHER, PIXEL_ROWS):
-            for y in range(ahead, ahead + PIXEL_ROWS):
-                clear_row(ring, y, vectors, pitch, L)
-            if y0 <= ahead <= y1:
-                a = fill_rows(params, splat, channel, ahead, box, frame, footprints, a, planes, work)
-        # the columns that any window of these rows can see of the splat
-        last = min(first + TOGETHER - 1, y1 + REACH)
-        lo, hi = hull_of(spans, max(first - REACH, y0), min(last + REACH, y1))
-        if hi < 0:
-            continue
-        lo, hi = lo - left, hi - left
-        columns = (max(lo - REACH, 0) // L * L, min((hi + REACH) // L, vectors - 1) * L)
-        # down the columns, then along each row, then into the sums
-        blur_columns(work, first, lo // L * L, hi, columns, pitch, L)
-        for row in range(max(first, 0), min(last + 1, frame.height)):
-            at = (row - first) * FIELDS * pitch + EDGE
-            add_windows(params, splat, row, left, columns, frame, planes, at, pitch, work)
-        unflushed += TOGETHER
-        if unflushed >= FLUSH:
-            flush(sums, L, part, total)
-            unflushed = 0
+    for x in range(0, vectors * L, L):
+        # rows with pixels that the windows of this strip can see
+        first, last = reach_of(spans, y0, y1, left + x - REACH, left + x + L - 1 + REACH)
+        for y in range(first, last + 1):
+            blur_row(fields, (y - y0) * FIELDS * pitch + EDGE + x, pitch, along, rows, (y - first) * BLURRED * L)
+        # the windows' centres
+        for y in range(max(first - REACH, 0), min(last + REACH + 1, frame.height)):
+            add_windows(params, splat, y, left + x, first, last, frame, planes, work)
+            unflushed += 1
+            if unflushed == FLUSH:
+                flush(sums, L, part, total)
+                unflushed = 0
     flush(sums, L, part, total)
 
 
 @formula
-def clear_row(ring, y, vectors, pitch, L):
-    """Write zeros to row y of every field."""
-    base = slot(y) * FIELDS * pitch + EDGE
-    for at in range(base, base + FIELDS * pitch, pitch):
-        for x in range(at, at + vectors * L, L):
-            store(ring, x, 0.0)
-
-
-@formula
-def fill_rows(params, splat, channel, y, box, frame, footprints, a, planes, work):
-    """Write PIXEL_ROWS rows of the fields, from y on, to the ring; return the splat's first accumulator in this row of tiles.
-
-    a: that of the row before, or the splat's first; accumulators are in order of their tiles' rows.
-    """
-    ring, _rows, corners, spans, _moved, _sums = work
-    _y0, _y1, left, vectors = box
-    layout, begin, values = footprints
-    L = lanes(params)
-    pitch, row = vectors * L + 2 * EDGE, y & -TILE_HEIGHT
-    lo, hi = hull_of(spans, y, y + PIXEL_ROWS - 1)
-    base = slot(y) * FIELDS * pitch + EDGE - left
-    first, last = layout.splat_start[splat], layout.splat_start[splat + 1]
-    # skip the tiles above this row
-    while corners[a - first, 0] < row:
-        a += 1
-    at = a
-    # the tiles of this row, as far as the splat has weight in them
-    while at < last and corners[at - first, 0] == row:
-        top, bottom = row_range(layout.rows[at])
-        inside, x = (y - row) // PIXEL_ROWS, corners[at - first, 1]
-        if top <= inside < bottom and x <= hi and x + L // PIXEL_ROWS > lo:
-            where = (layout.place[at] - layout.place[begin] + inside - top) * FOOTPRINT * L
-            fill_lanes(params, splat, x, y, channel, frame, where, values, planes, ring, base + x, pitch)
-        at += 1
-    return a
-
-
-@formula
-def fill_lanes(params, splat, x, y, channel, frame, where, values, planes, ring, to, pitch):
-    """Write the fields of the vector of pixels at (x, y) to the ring at `to`; its w and D are in values at `where`."""
-    L = lanes(params)
-    image, target, _seconds, top = planes
-    _u, terms = alpha_terms(params, splat * PARAMS, x, y)
-    v = terms[0]
-    w, D = load(values, where), load(values, where + (1 + channel) * L)
-    p = top + y * frame.stride + x
-    photo = load_pixels(target, p, frame.stride)
-    # the factors f: 1, 2 r, y - c
-    residual = load_pixels(image, p, frame.stride) - photo
-    put_powers(ring, to, pitch, w, D, v)
-    put_powers(ring, to + POWERS * pitch, pitch, 2.0 * residual * w, 2.0 * residual * D, v)
-    put_powers(ring, to + 2 * POWERS * pitch, pitch, (photo - CENTRE) * w, (photo - CENTRE) * D, v)
-
-
-@formula
-def put_powers(ring, to, pitch, w, D, v):
-    """Write the POWERS fields of a factor."""
-    Dv = D * v
-    step = FIELDS * pitch  # a row of pixels to the next one: y is even
-    store_pixels(ring, to, step, D)
-    store_pixels(ring, to + pitch, step, Dv)
-    store_pixels(ring, to + 2 * pitch, step, Dv * v)
-    store_pixels(ring, to + 3 * pitch, step, w)
-
-
-@formula
-def slot(y):
-    """Place of a row in the ring."""
-    return y & (RING - 1)
+def reach_of(spans, y0, y1, lo, hi):
+    """First and last of the rows y0 .. y1 with a pixel in the columns lo .. hi; y1 + 1 and y0 - 1 - 2 REACH if none has."""
+    first, last = y1 + 1, y0 - 1 - 2 * REACH
+    for y in range(y0, y1 + 1):
+        if spans[y, 0] <= hi and spans[y, 1] >= lo:
+            first, last = min(first, y), y
+    return first, last
 
 
 @formula
@@ -246,92 +224,76 @@ def dot5(x, taps):
 
 
 @formula
-def blurred(F):
-    """The middle of eleven rows, blurred."""
-    return weighted(F[5], (F[6] + F[4], F[7] + F[3], F[8] + F[2], F[9] + F[1], F[10] + F[0]), TAPS)
+def blur_row(fields, at, pitch, along, rows, to):
+    """Blur the fields at `at` along their row, to rows at `to`: of each factor f D with the powers 0, 1, 2 of a t, and f w."""
+    L = lanes(fields)
+    for _ in range(FACTORS):
+        s, d = both_ways(fields, at)
+        store(rows, to, weighted(load(fields, at), s, TAPS))
+        store(rows, to + L, along * dot5(d, FIRST))
+        store(rows, to + 2 * L, along * along * dot5(s, SECOND))
+        store(rows, to + 3 * L, weighted(load(fields, at + pitch), both_ways(fields, at + pitch)[0], TAPS))
+        at, to = at + 2 * pitch, to + 4 * L
 
 
 @formula
-def blur_columns(work, row, lo, hi, columns, pitch, L):
-    """Blur TOGETHER rows of every field, from this row on, down the columns lo .. hi: each row of the ring is read once.
-
-    0 in the other columns that windows centred in `columns` reach.
-    """
-    ring, rows, _corners, _spans, _moved, _sums = work
-    step, (first, last) = FIELDS * pitch, columns
-    for at in range(EDGE, EDGE + step, pitch):
-        for x in range(at + first - max(L, 8), at + last + max(L, 8) + L, L):
-            if lo <= x - at <= hi:
-                F = (
-                    load(ring, x + slot(row - 5) * step), load(ring, x + slot(row - 4) * step),
-                    load(ring, x + slot(row - 3) * step), load(ring, x + slot(row - 2) * step),
-                    load(ring, x + slot(row - 1) * step), load(ring, x + slot(row) * step),
-                    load(ring, x + slot(row + 1) * step), load(ring, x + slot(row + 2) * step),
-                    load(ring, x + slot(row + 3) * step), load(ring, x + slot(row + 4) * step),
-                    load(ring, x + slot(row + 5) * step), load(ring, x + slot(row + 6) * step),
-                    load(ring, x + slot(row + 7) * step), load(ring, x + slot(row + 8) * step),
-                )  # fmt: skip
-                store(rows, x, blurred(F[0:11]))
-                store(rows, x + step, blurred(F[1:12]))
-                store(rows, x + 2 * step, blurred(F[2:13]))
-                store(rows, x + 3 * step, blurred(F[3:14]))
-            else:
-                for k in range(TOGETHER):
-                    store(rows, x + k * step, 0.0)
-
-
-@formula
-def add_windows(params, splat, row, left, columns, frame, planes, at, pitch, work):
-    """Add M . S'' M' of the windows centred in a row, in these columns, to the sums; at: where its blurred fields begin."""
+def add_windows(params, splat, y, x, first, last, frame, planes, work):
+    """Add M . S'' M' of the windows centred in row y, from column x on, to the sums; first, last: rows with weight."""
     _image, _target, seconds, top = planes
-    _ring, rows, _corners, _spans, moved, sums = work
-    L = lanes(params)
-    along, size = broadcast(params, params[splat * PARAMS + ALONG]), 3 * frame.size
-    for x in range(columns[0], columns[1] + L, L):
-        u = column_u(params, splat * PARAMS, left + x, iota(params))
-        for factor in range(FACTORS):
-            blur_row(rows, at + POWERS * factor * pitch + x, pitch, u, along, moved, SLOPES * factor * L)
-        p = top + row * frame.stride + left + x
-        second = (
-            load(seconds, p), load(seconds, p + size), load(seconds, p + 2 * size),
-            load(seconds, p + 3 * size), load(seconds, p + 4 * size),
-        )  # fmt: skip
-        add_pairs(moved, second, sums, L)
+    _fields, rows, taps, _spans, sums = work
+    L, o, zero = lanes(params), splat * PARAMS, broadcast(params, 0.0)
+    # down the columns: B_00, B_10, B_20, B_01, B_11, B_02 and w of each factor
+    E = F = G = (zero, zero, zero, zero, zero, zero, zero)
+    for k in range(max(first, y - REACH), min(last, y + REACH) + 1):
+        at, g = (k - first) * BLURRED * L, load_all(taps, 3 * (k - y + REACH) * L, 3)
+        E = weigh_row(E, load_all(rows, at, 4), g)
+        F = weigh_row(F, load_all(rows, at + 4 * L, 4), g)
+        G = weigh_row(G, load_all(rows, at + 8 * L, 4), g)
+    # the offset of the windows' centres, as in `tile.alpha_terms`
+    u, ratio = column_u(params, o, x, iota(params)), params[o + STEP] / params[o + ALONG]
+    dx, dy = x - load_double(params, o + MX), y - load_double(params, o + MY)
+    v = fma(iota(params), params[o + STEP], params[o + ACROSS] * (load_double(params, o + SHEAR) * dx + dy))
+    p, size = top + y * frame.stride + x, 3 * frame.size
+    second = (
+        load(seconds, p), load(seconds, p + size), load(seconds, p + 2 * size),
+        load(seconds, p + 3 * size), load(seconds, p + 4 * size),
+    )  # fmt: skip
+    # rows further down are not in the cache yet
+    for k in range(5):
+        prefetch(seconds, p + k * size + AHEAD * frame.stride)
+        prefetch(seconds, p + k * size + AHEAD * frame.stride + L - 1)
+    add_pairs(slopes_of(E, u, v, ratio), slopes_of(F, u, v, ratio), slopes_of(G, u, v, ratio), second, sums, L)
 
 
 @formula
-def blur_row(rows, at, pitch, u, along, moved, to):
-    """Blur along a row, for the vector at `at`: one component of M for each slope, to moved."""
-    L = lanes(rows)
-    # D f: B_0, B_1 and B_2 from the sums and differences at equal distances
-    s, d = both_ways(rows, at)
-    B0, B1, B2 = weighted(load(rows, at), s, TAPS), along * dot5(d, FIRST), along * along * dot5(s, SECOND)
-    # D f v: the same without the second power of u
-    s, d = both_ways(rows, at + pitch)
-    C0, C1 = weighted(load(rows, at + pitch), s, TAPS), along * dot5(d, FIRST)
-    uB = u * B0 + B1
-    # slopes D, D u, D v, D u^2, D u v; then D v^2 and w, which have no u
-    store(moved, to, B0)
-    store(moved, to + L, uB)
-    store(moved, to + 2 * L, C0)
-    store(moved, to + 3 * L, u * (uB + B1) + B2)
-    store(moved, to + 4 * L, u * C0 + C1)
-    for field in range(2, 4):
-        at_field = at + field * pitch
-        store(moved, to + (3 + field) * L, weighted(load(rows, at_field), both_ways(rows, at_field)[0], TAPS))
+def weigh_row(B, R, g):
+    """B and a blurred row times its taps g_s (b s)^j."""
+    R0, R1, R2, w = R
+    return (
+        B[0] + g[0] * R0, B[1] + g[0] * R1, B[2] + g[0] * R2, B[3] + g[1] * R0, B[4] + g[1] * R1, B[5] + g[2] * R0,
+        B[6] + g[0] * w,
+    )  # fmt: skip
 
 
 @formula
-def add_pairs(moved, second, sums, L):
-    """Add M . S'' M' of every pair of slopes to the sums."""
+def slopes_of(B, u, v, r):
+    """A component of M for each slope: D, D u, D v, D u^2, D u v, D v^2 and w."""
+    B00, B10, B20, B01, B11, B02, w = B
+    # u of a pixel is the centre's and a t, v the centre's and dv, of r a t and b s
+    dv = r * B10 + B01
+    Du, Dv = u * B00 + B10, v * B00 + dv
+    Duv = u * Dv + (v * B10 + (r * B20 + B11))
+    return B00, Du, Dv, u * (Du + B10) + B20, Duv, v * (Dv + dv) + (r * (r * B20 + (B11 + B11)) + B02), w
+
+
+@formula
+def add_pairs(E, F, G, second, sums, L):
+    """Add M . S'' M' of every pair of slopes to the sums; E, F, G: the components of M."""
     j = 0
     for a in range(SLOPES):
-        n0, n1, n2 = ssim_second_dot(
-            second, load(moved, a * L), load(moved, (SLOPES + a) * L), load(moved, (2 * SLOPES + a) * L)
-        )
+        n0, n1, n2 = ssim_second_dot(second, E[a], F[a], G[a])
         for b in range(a + 1):
-            m0, m1, m2 = load(moved, b * L), load(moved, (SLOPES + b) * L), load(moved, (2 * SLOPES + b) * L)
-            store(sums, (j + b) * L, load(sums, (j + b) * L) + n0 * m0 + n1 * m1 + n2 * m2)
+            store(sums, (j + b) * L, load(sums, (j + b) * L) + n0 * E[b] + n1 * F[b] + n2 * G[b])
         j += a + 1
 
 

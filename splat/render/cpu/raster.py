@@ -150,9 +150,8 @@ class CpuRaster:
         (lists, splat_start), splats = self.reached, index.numpy()
         blocks = np.zeros((len(splats), SPLAT, SPLAT))
         layout, row = footprints.footprints_of(lists, splat_start), footprints.FOOTPRINT * lanes_of(self.dtype)
-        rows, ends = np.diff(layout.place[splat_start])[splats], layout.place[splat_start[splats + 1]]
+        ends, start = layout.place[splat_start[splats + 1]], 0
         most = max(FOOTPRINT_BYTES // (row * self.dtype.itemsize), 1)
-        start = 0
         while start < len(splats):
             begin = splat_start[splats[start]]
             stop = max(int(np.searchsorted(ends, layout.place[begin] + most, side="right")), start + 1)
@@ -160,13 +159,12 @@ class CpuRaster:
             values = aligned((int(layout.place[end] - layout.place[begin]) * row,), self.dtype)
             view = (self.params, lists, self.frame, self.pixels)
             over_tiles(footprints.find_footprints, *view, layout, begin, end, values)
-            heaviest = start + np.argsort(rows[start:stop])[::-1]
-            part = np.zeros((stop - start, SPLAT, SPLAT))
+            # neighbours one after the other: the pixels under them stay in the cache
+            order = start + np.argsort(layout.tiles[splat_start[splats[start:stop]]], kind="stable")
             over_tiles(
-                coupling.coupled_blocks, splats[heaviest], self.params, self.frame, (layout, begin, values),
-                *coupled[:3], part,
+                coupling.coupled_blocks, order, splats, self.params, self.frame, (layout, begin, values), *coupled[:3],
+                coupled.weight, blocks,
             )  # fmt: skip
-            blocks[heaviest] = coupled.weight * part
             start = stop
         return torch.from_numpy(coupled.uncoupled).view(3, *self.plane), torch.from_numpy(blocks)
 
