@@ -11,7 +11,7 @@ from splat.curvature.objective import SceneObjective
 from splat.render.forward import rasterize_view
 
 GEOMETRY_BLOCK = 11 * 11  # numbers of a Gaussian's block without SH
-KEPT_BLOCKS = 4  # sets of blocks: approximate and exact ones, each of the Hessian and of a Gauss-Newton part
+KEPT_BLOCKS = 3  # sets of blocks: exact ones, approximate ones, and these of the Gauss-Newton part
 COPIES = 5  # of a vector in a product: the argument, its projection, the sum over views, a view's product, the result
 BASIS, BATCH = 8, 4  # vectors of the smallest basis of an eigensolver, and in its products
 GIB = 2**30

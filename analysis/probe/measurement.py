@@ -83,7 +83,6 @@ LEFT_OUT = {  # notes on stages that the settings exclude
 RISE, HALVINGS, MOST_DOUBLINGS = 0.01, 5, 5
 MIXED = 0.1  # largest error of an eigenvector whose participation is recorded: 1% of its mass lies elsewhere
 FEW_POINTS = 8  # renders for the estimate of a render's noise
-MOST_SAMPLES = 64  # of a trace on a CPU: more would take longer than summing the exact blocks
 
 
 def measure(
@@ -126,6 +125,11 @@ class _Point:
     settings: ProbeSettings
     gradient: Tensor
     value: float
+
+    @property
+    def exact_blocks(self) -> bool:
+        """Whether exact blocks of the Gaussians are made: on a CPU, they take less time than traces sampled to 1%."""
+        return not self.settings.trace_samples and backend_of(self.objective.active.flat).exact_blocks
 
 
 def _linearised(objective: SceneObjective, settings: ProbeSettings, ranks: Ranks, report: Progress) -> _Point:
@@ -187,15 +191,10 @@ def _left_out(at: _Point, ends: EigenEnds, population: int) -> LeftOut:
 
 
 def _traces(at: _Point, generator: torch.Generator, report: Progress, _: list[str]) -> dict[str, TraceEstimate]:
-    """Traces at their accuracy; on a CPU, those that need more than MOST_SAMPLES samples are summed over exact blocks."""
-    allowed, samples = at.settings.traces, at.settings.trace_samples
-    if samples or not backend_of(at.objective.active.flat).exact_blocks:
-        return exact_traces(at.objective, generator, allowed, report, samples=samples)
-    few = replace(allowed, max_probes=min(allowed.max_probes, MOST_SAMPLES))
-    found = exact_traces(at.objective, generator, few, report)
-    inexact = {name for name, trace in found.items() if trace.reason == "matvec budget"}
-    exact = block_traces(at.objective) if inexact else {}
-    return {name: exact[name] if name in inexact else trace for name, trace in found.items()}
+    """Traces summed over exact blocks, where these are made; else sampled to their accuracy."""
+    if at.exact_blocks:
+        return block_traces(at.objective, report)
+    return exact_traces(at.objective, generator, at.settings.traces, report, samples=at.settings.trace_samples)
 
 
 def _ends(at: _Point, generator: torch.Generator, report: Progress, notes: list[str]) -> Search:
@@ -210,7 +209,8 @@ def _ends(at: _Point, generator: torch.Generator, report: Progress, notes: list[
             f"the search for extreme eigenvalues kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB "
             "and half of what was free"
         )
-    start = BlockEigenvectors(at.objective, *at.objective.approximate_blocks).warm_start()
+    blocks, pixelwise = (at.objective.exact_blocks, None) if at.exact_blocks else at.objective.approximate_blocks
+    start = BlockEigenvectors(at.objective, blocks, pixelwise).warm_start()
     eigen = replace(eigen, basis=basis)
     lifted = LiftedOperator(at.operator, at.hessian.project, spawn(generator))
     found = extreme_eigenpairs(lifted, generator, eigen, start, report)

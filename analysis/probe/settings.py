@@ -17,7 +17,8 @@ class ProbeSettings:
     """Amounts of everything; the defaults are for numbers to 1%.
 
     checked_vectors, checked_views: of the self-checks.
-    trace_samples: exactly so many for each trace; None: as many as `traces` asks for.
+    traces: their accuracy where they are sampled: a CPU sums exact blocks, which takes less time than samples to 1%.
+    trace_samples: exactly so many for each trace; None: exact blocks, or as many as `traces` asks for.
     power: iterates of power iteration, read from the density.  density_matvecs: products of the spectral density (a tenth of
         them see the ends again); 0: it is left out.
     slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share

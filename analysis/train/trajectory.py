@@ -169,12 +169,14 @@ def measure(objective: SceneObjective, generator: torch.Generator, settings: Tra
     operator = CountingOperator(hessian)
     if whole and objective.active.flat.device.type == "cpu":
         traces = block_traces(objective)
+        blocks, pixelwise = objective.exact_blocks, None
     else:
         traces = exact_traces(objective, streams[0], settings.traces, samples=None if whole else LEAST_SAMPLES)
+        blocks, pixelwise = objective.approximate_blocks
     eigen = settings.eigen
     if not whole:
         eigen = replace(eigen, rtol=max(eigen.rtol, 0.1), max_matvecs=min(eigen.max_matvecs, COARSE_MATVECS))
-    leads = BlockEigenvectors(objective, *objective.approximate_blocks).warm_start()
+    leads = BlockEigenvectors(objective, blocks, pixelwise).warm_start()
     lifted = LiftedOperator(operator, hessian.project, spawn(streams[1]))  # as in a probe
     ends = extreme_eigenpairs(lifted, streams[1], eigen, leads)
     density = None

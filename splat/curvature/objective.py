@@ -235,9 +235,14 @@ class SceneObjective:
         ]
 
     @cached_property
-    def exact_blocks(self) -> list[PerGaussianBlocks]:
-        """The blocks of the Hessian and of its Gauss-Newton part."""
-        return self.block_diagonals()
+    def exact_blocks(self) -> PerGaussianBlocks:
+        """The blocks of the Hessian."""
+        return self.block_diagonal()
+
+    @cached_property
+    def exact_gauss_newton_blocks(self) -> PerGaussianBlocks:
+        """The blocks of its Gauss-Newton part."""
+        return self.block_diagonal(gauss_newton=True)
 
     @cached_property
     def approximate_blocks(self) -> tuple[PerGaussianBlocks, PerGaussianBlocks | None]:

@@ -89,9 +89,9 @@ def exact_traces(
     return sampled_traces(objective, generator, partial(_signs, objective, scale), traces, progress)
 
 
-def block_traces(objective: SceneObjective) -> dict[str, TraceEstimate]:
-    """The same traces without sampling: sums over the exact diagonal blocks of the Gaussians, on the CPU only."""
-    blocks = objective.exact_blocks[0]
+def block_traces(objective: SceneObjective, progress: Progress | None = None) -> dict[str, TraceEstimate]:
+    """The same traces without sampling: sums over `objective.exact_blocks`, which are made anew; on the CPU only."""
+    objective.exact_blocks = blocks = objective.block_diagonals(parts=(False,), progress=progress)[0]
     found = {}
     for name, value in blocks.traces(objective.active.quats).items():
         terms = torch.tensor([view[name] for view in blocks.views], dtype=torch.float64)

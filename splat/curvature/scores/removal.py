@@ -47,11 +47,11 @@ def removal_scores(objective: SceneObjective, l2: SceneObjective) -> dict[str, F
     (True, True)
     """
     active = l2.active
-    geometry = l2.exact_blocks[1].geometry.double()
+    geometry = l2.exact_gauss_newton_blocks.geometry.double()
     complement = on_complement(geometry, active.quats.double())
     eps = torch.finfo(active.flat.dtype).eps
     diagonal = torch.cat(
-        [part for name, part in l2.exact_blocks[1].diagonals_across(active.quats).items() if name != "sh"], 1
+        [part for name, part in l2.exact_gauss_newton_blocks.diagonals_across(active.quats).items() if name != "sh"], 1
     )
     omega = active.opacity_logits.double().sigmoid()
     return {
@@ -70,7 +70,7 @@ def predicted_rise(objective: SceneObjective) -> Float64[Tensor, " n"]:
     objective = _below_opaque(objective)
     z = objective.active.opacity_logits.double()
     slope = objective.gradient[objective.blocks["opacity_logits"]].double()
-    curvature = objective.exact_blocks[1].geometry[:, 10, 10].double()
+    curvature = objective.exact_gauss_newton_blocks.geometry[:, 10, 10].double()
     return -slope / (-z).sigmoid() + curvature / (2 * (-z).sigmoid().square())
 
 

@@ -99,7 +99,7 @@ def test_the_search_for_the_ends_begins_at_the_directions_of_single_gaussians(at
 
     monkeypatch.setattr("analysis.train.trajectory.extreme_eigenpairs", noted)
     measure(objective, torch.Generator().manual_seed(0), TrajectorySettings(EVERY))
-    assert torch.equal(starts[0], BlockEigenvectors(objective, *objective.approximate_blocks).warm_start())
+    assert torch.equal(starts[0], BlockEigenvectors(objective, objective.exact_blocks).warm_start())
 
 
 def test_a_row_is_the_landscape_within_its_errors(at_the_end, tmp_path):

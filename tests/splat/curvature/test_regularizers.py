@@ -74,9 +74,9 @@ def test_blocks_and_traces_are_those_of_the_dense_hessian_and_gauss_newton_has_n
     identity = torch.eye(objective.active.flat.numel(), dtype=torch.float64)
     H = SceneHessian(objective, keep_null=True).apply(identity)
     logits, scales = objective.blocks["opacity_logits"], objective.blocks["log_scales"]
-    exact, gauss_newton = objective.exact_blocks
+    exact, gauss_newton = objective.exact_blocks, objective.exact_gauss_newton_blocks
     for blocks in (exact, objective.approximate_blocks[0]):
-        added = blocks.geometry - (bare.exact_blocks[0] if blocks is exact else bare.approximate_blocks[0]).geometry
+        added = blocks.geometry - (bare.exact_blocks if blocks is exact else bare.approximate_blocks[0]).geometry
         difference = H - SceneHessian(bare, keep_null=True).apply(identity)
         torch.testing.assert_close(added[:, 10, 10], difference.diagonal()[logits], rtol=1e-9, atol=1e-15)
         torch.testing.assert_close(
@@ -84,7 +84,7 @@ def test_blocks_and_traces_are_those_of_the_dense_hessian_and_gauss_newton_has_n
         )
     diagonal = exact.diagonals
     torch.testing.assert_close(diagonal["opacity_logits"][:, 0], H.diagonal()[logits], rtol=1e-10, atol=1e-14)
-    assert torch.equal(gauss_newton.geometry, bare.exact_blocks[1].geometry)
+    assert torch.equal(gauss_newton.geometry, bare.exact_gauss_newton_blocks.geometry)
     assert torch.equal(*(SceneHessian(x, gauss_newton=True, keep_null=True).apply(identity) for x in (objective, bare)))
     traces = exact_traces(objective, torch.Generator().manual_seed(0), samples=64)
     for name, trace in block_traces(objective).items():
