@@ -332,7 +332,7 @@ def plane_of(
     # E^T H E of Ritz vectors E is diagonal: no product is needed
     plane = evaluate_slice(
         loss, center, vectors, axes, gradient, curvatures.diag(), accuracy, generator, progress=report,
-        control=nearby and evaluation(nearby, workers),
+        control=nearby and nearby._replace(loss=evaluation(nearby.loss, workers)),
     )  # fmt: skip
     return PlaneSlice(plane, loss_scale, (first, second))
 

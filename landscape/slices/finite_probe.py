@@ -34,7 +34,7 @@ from landscape.errors import InputError
 from landscape.linalg import column_lengths
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.results import Progress, ShortRepr, plain
-from landscape.slices.grid_evaluations import Loss
+from landscape.slices.grid_evaluations import Control, Loss
 
 ORDER, NOISE_POINTS = 4, 24  # order of the differences, number of values
 CLOSER = 4  # the distance between these values is the smallest step over this ...
@@ -95,7 +95,7 @@ def finite_probe(
     steps: Sequence[float] = STEPS,
     progress: Progress | None = None,
     noise_points: int = NOISE_POINTS,
-    control: Loss | None = None,
+    control: Control | None = None,
 ) -> FiniteProbe:
     """Curvature along direction at finite steps, for one matvec and 2 len(steps) + 1 + noise_points evaluations.
 
@@ -118,7 +118,7 @@ def finite_probe(
     whole = at = _Line(loss, origin, v, center.dtype, total, progress)
     center_loss, here = middle, _ = at(0.0)
     if control is not None:
-        at = _Line(control, origin, v, center.dtype, total, progress)
+        at = _Line(control.loss, origin[control.rows], v[control.rows], center.dtype, total, progress)
         middle, here = at(0.0)[0], None
     if not isfinite(middle):
         raise InputError(f"expected a finite objective at the centre, got {middle}")

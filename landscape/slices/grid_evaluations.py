@@ -10,11 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from math import isfinite
 from time import monotonic
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from landscape.errors import InputError
@@ -23,6 +23,13 @@ from landscape.results import Progress
 Evaluation = float | Tensor | tuple[float | Tensor, Hashable]
 Loss = Callable[[Tensor], Evaluation]
 """loss(theta) -> the objective, or (the objective, smooth_piece): a label of the smooth piece that contains theta."""
+
+
+class Control(NamedTuple):
+    """A cheap function that differs from an objective by little that is smooth: loss(theta[rows])."""
+
+    loss: Loss
+    rows: Int[Tensor, " m"]
 
 
 class Store(Protocol):

@@ -20,7 +20,7 @@ from landscape.errors import InputError
 from landscape.linalg import column_lengths
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.results import Progress
-from landscape.slices.grid_evaluations import GridEvaluations, Loss, Store
+from landscape.slices.grid_evaluations import Control, GridEvaluations, Loss, Store
 from landscape.slices.interpolation import PlaneInterpolant
 from landscape.slices.refinement import CONTROLLED, Refined, SliceSettings, evaluate_adaptively
 from landscape.slices.slice import Slice
@@ -68,7 +68,7 @@ def evaluate_slice(
     generator: torch.Generator | None = None,
     store: Store | None = None,
     progress: Progress | None = None,
-    control: Loss | None = None,
+    control: Control | None = None,
 ) -> Slice:
     """loss on the grid coordinates[0] x coordinates[1] (d = 2) or along coordinates[0] (d = 1).
 
@@ -76,8 +76,8 @@ def evaluate_slice(
     settings.workers threads.  coordinates: increasing, in multiples of the directions.  gradient, operator: both at center, for
     the quadratic model, or neither; the model takes d matvecs, or none if the operator is given as the matrix E^T H E.
     settings: for a plane; every point of a line is evaluated.  generator: draws the hold-out points (`refinement`) of a plane;
-    may be None only if settings.tolerance is.  store: keeps evaluations, from which an interrupted run continues.  control: a
-    cheap function that differs from loss by little that is smooth; a plane then takes few evaluations of loss (`refinement`).
+    may be None only if settings.tolerance is.  store: keeps evaluations, from which an interrupted run continues.  control: of
+    loss; a plane then takes few evaluations of loss itself (`refinement`).
     Raises InputError if the objective at the centre is not finite.
 
     >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
@@ -102,7 +102,8 @@ def evaluate_slice(
         model = model.reshape(shape)
     cheap = None
     if control is not None and settings.tolerance is not None and len(axes) == 2:
-        cheap = GridEvaluations(control, center, directions, points, settings.workers, progress=progress)
+        some = center[control.rows], directions[control.rows]
+        cheap = GridEvaluations(control.loss, *some, points, settings.workers, progress=progress)
     mixed = None if curvature is None or cheap else float(curvature[0, -1])
     refined = _refined(found, axes, mixed, settings, generator, cheap)
     return Slice(

@@ -4,6 +4,7 @@ import torch
 
 from landscape.operators.operator import DenseOperator
 from landscape.slices.finite_probe import NOISE_POINTS, ORDER, STEPS, evaluation_noise, finite_probe
+from landscape.slices.grid_evaluations import Control
 from tests.oracles import symmetric_matrix
 from tests.refusals import misused
 
@@ -109,13 +110,10 @@ def test_with_a_control_a_few_evaluations_tell_the_rest():
     def whole(theta):
         return rough(theta) + 0.01 * float((theta**4).sum())
 
-    steps, center, v = (
-        [0.01 * 2**k for k in range(11)],
-        torch.zeros(1, dtype=torch.float64),
-        torch.ones(1, dtype=torch.float64),
-    )
+    steps, center = [0.01 * 2**k for k in range(11)], torch.zeros(1, dtype=torch.float64)
+    v, controls = center + 1, (None, Control(rough, torch.arange(1)))
     H = DenseOperator(torch.full((1, 1), 2.0, dtype=torch.float64))
-    alone, found = (finite_probe(whole, center, v, H, steps, control=each) for each in (None, rough))
+    alone, found = (finite_probe(whole, center, v, H, steps, control=each) for each in controls)
     off = (found.curvatures - alone.curvatures).abs()
     assert found.evaluations == 1 + 2 * 4 < alone.evaluations / 4 and found.center_loss == alone.center_loss
     assert (off[[4, 6, 8, 10]] < 1e-9).all() and off[9] > 0.01 and (off <= found.round_off).all()

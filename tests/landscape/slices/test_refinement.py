@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from landscape.slices.grid_evaluations import Control
 from landscape.slices.refinement import SliceSettings
 from landscape.slices.slices import evaluate_slice, symmetric_axis
 from tests.refusals import misused
@@ -160,14 +161,14 @@ def test_of_noise_every_point_is_evaluated():
 
 def test_with_a_control_that_has_the_jumps_few_evaluations_tell_the_rest():
     for seed in range(5):
-        found = sliced(beside, seed, control=jumps)
+        found = sliced(beside, seed, control=Control(jumps, torch.arange(2)))
         assert found.evaluations == 1 + 1 + 16 + 22 < sliced(beside, seed).evaluations and found.reason == "tolerance"
         assert 0 < found.error_seen <= found.interpolation_error <= 0.01
         assert errors(beside, found).max() <= found.interpolation_error
 
 
 def test_a_control_without_the_jumps_costs_evaluations_and_no_accuracy():
-    found = [sliced(jumps, seed, control=bowl) for seed in range(10)]
+    found = [sliced(jumps, seed, control=Control(bowl, torch.arange(2))) for seed in range(10)]
     off = [errors(jumps, each).max() for each in found]
     assert all(each.evaluations > 100 and each.interpolation_error <= 0.01 for each in found) and max(off) <= 0.01
     assert sum(error > each.interpolation_error for error, each in zip(off, found, strict=True)) <= 3  # of 10, 95% each
