@@ -13,33 +13,26 @@ def project_colours(start, stop, basis, rank, row, slopes, slope_rank, x, out):
     harmonics; row (n, 3): the space of each channel.  slopes (n, s, b, 3), slope_rank (n,).  A channel whose space is complete
     is copied bit for bit.
     """
-    bands, width = x.shape[1], x.shape[2]
-    vectors = width // 3
-    along = np.empty(width, x.dtype)
+    bands, vectors = x.shape[1], x.shape[2] // 3
     for i in range(start, stop):
-        same = row[i, 0] == row[i, 1] == row[i, 2]  # then one pass does the three channels
-        for c in range(1 if same else 3):
+        for c in range(3):
             j = row[i, c]
-            first, last = (0, width) if same else (c * vectors, (c + 1) * vectors)
-            whole = rank[j] == bands
-            for b in range(bands):
-                for k in range(first, last):
+            for k in range(c * vectors, (c + 1) * vectors):
+                whole = rank[j] == bands
+                for b in range(bands):
                     out[i, b, k] = x[i, b, k] if whole else 0
-            for r in range(0 if whole else rank[j]):
-                along[first:last] = 0
-                for b in range(bands):
-                    for k in range(first, last):
-                        along[k] += basis[j, r, b] * x[i, b, k]
-                for b in range(bands):
-                    for k in range(first, last):
-                        out[i, b, k] += basis[j, r, b] * along[k]
+                for r in range(0 if whole else rank[j]):
+                    along = x.dtype.type(0)
+                    for b in range(bands):
+                        along += basis[j, r, b] * x[i, b, k]
+                    for b in range(bands):
+                        out[i, b, k] += basis[j, r, b] * along
         for s in range(slope_rank[i]):
-            along[:vectors] = 0
-            for b in range(bands):
-                for c in range(3):
-                    for k in range(vectors):
-                        along[k] += slopes[i, s, b, c] * x[i, b, c * vectors + k]
-            for b in range(bands):
-                for c in range(3):
-                    for k in range(vectors):
-                        out[i, b, c * vectors + k] += slopes[i, s, b, c] * along[k]
+            for k in range(vectors):
+                along = x.dtype.type(0)
+                for b in range(bands):
+                    for c in range(3):
+                        along += slopes[i, s, b, c] * x[i, b, c * vectors + k]
+                for b in range(bands):
+                    for c in range(3):
+                        out[i, b, c * vectors + k] += slopes[i, s, b, c] * along
