@@ -1,7 +1,5 @@
 """Projection of SH coefficients onto a `ColourSpace` on the CPU: one pass over the Gaussians."""
 
-import numpy as np
-
 from splat.backend.cpu.jit import kernel
 
 
