@@ -16,8 +16,8 @@ So the slopes' M are those of D's moments in a window, times powers of u and v a
     blur(v F) = v B_00 + r B_10 + B_01    and so on (`slopes_of`)
 
 The blur is separable: each row of a splat's fields F and f w is blurred along itself with the powers of a t, and these down the
-columns with those of b s, a strip of windows, `lanes` wide, at a time.  Rows without weight are left out.  Sums are moved to
-double precision every FLUSH rows.  Three tuples go through the functions:
+columns with those of b s, a strip of windows, `lanes` wide, at a time.  Rows without weight are left out.  Fields take 24 bytes
+a pixel of a splat's box in single precision.  Sums are moved to double precision every FLUSH rows.  Three tuples go through:
 
     footprints   (layout, begin, values): `Footprints`, and w and D of the accumulators from begin on (`find_footprints`)
     planes       (image, target, seconds, index of the channel's first pixel): of `losses.cpu.loss.Coupling`
@@ -54,7 +54,7 @@ FIELDS = 2 * FACTORS  # f D and f w
 BLURRED = 4 * FACTORS  # along a row: f D with the powers 0, 1, 2 of a t, and f w
 SLOPES = 7  # of a channel in a splat's numbers, in the order of its block: six of geometry, one of colour
 PAIRS = SLOPES * (SLOPES + 1) // 2
-AHEAD = 3  # rows between a prefetch and its use
+AHEAD = 3  # rows of windows between a prefetch and its use; of a footprint twice as many vectors
 EDGE = 16  # floats of padding at either side of a row: at least a vector, and REACH
 FLUSH = 16  # rows
 TAPS = tuple(float(tap) for tap in window(torch.float64)[REACH:])
@@ -91,11 +91,11 @@ def coupled_blocks(counter, order, index, params, frame, footprints, image, targ
 def find_spans(splat, frame, footprints, spans, weights, L):
     """First and last row in which a splat has weight; fills spans (see `work`).  weights: space for a vector."""
     layout, begin, values = footprints
-    y0, y1, done = frame.size, np.int64(-1), np.int64(0)
+    y0, y1, done = frame.size, np.int64(-1), np.int64(-1)
     for a in range(layout.splat_start[splat], layout.splat_start[splat + 1]):
         row, column = corner_of_tile(layout, a, frame, L)
-        # the rows of a new row of tiles have no columns yet
-        for y in range(max(row, done), row + TILE_HEIGHT):
+        # rows down to the end of this row of tiles have no columns yet
+        for y in range(row if done < 0 else done, row + TILE_HEIGHT):
             spans[y, 0], spans[y, 1] = frame.stride, -1
         done = row + TILE_HEIGHT
         top, bottom = row_range(layout.rows[a])
