@@ -54,9 +54,10 @@ def number_rows(data: ProbeRecord) -> dict[str, list[Row]]:
 
 def _trace_rows(data: ProbeRecord) -> Iterator[Row]:
     for name, trace in data.traces.items():
+        made = f", {trace.probes} samples" if trace.probes else ""
         about = (
-            f"{limits(trace.low, trace.high)}, {trace.sign}, τ {quantity(trace.tau)}, dim {trace.dim:,}, {trace.method}, "
-            f"{trace.probes} samples{_reason(trace.reason)}{_of_views(trace.views_error)}"
+            f"{limits(trace.low, trace.high)}, {trace.sign}, τ {quantity(trace.tau)}, dim {trace.dim:,}, {trace.method}"
+            f"{made}{_reason(trace.reason)}{_of_views(trace.views_error)}"
         )
         yield f"trace of {attribute_name(name)}", measured(trace.value, trace.standard_error), about
 
