@@ -110,9 +110,9 @@ def test_with_a_control_a_few_evaluations_tell_the_rest():
     def whole(theta):
         return rough(theta) + 0.01 * float((theta**4).sum())
 
-    steps, center = [0.01 * 2**k for k in range(11)], torch.zeros(1, dtype=torch.float64)
-    v, controls = center + 1, (None, Control(rough, torch.arange(1)))
-    H = DenseOperator(torch.full((1, 1), 2.0, dtype=torch.float64))
+    steps, center = [0.01 * 2**k for k in range(11)], torch.zeros(2, dtype=torch.float64)
+    v, controls = torch.tensor([0.0, 1.0], dtype=torch.float64), (None, Control(rough, torch.tensor([1])))
+    H = DenseOperator(2 * torch.eye(2, dtype=torch.float64))
     alone, found = (finite_probe(whole, center, v, H, steps, control=each) for each in controls)
     off = (found.curvatures - alone.curvatures).abs()
     assert found.evaluations == 1 + 2 * 4 < alone.evaluations / 4 and found.center_loss == alone.center_loss
