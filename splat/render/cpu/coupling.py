@@ -33,12 +33,10 @@ from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, load_pixels, scrat
 from splat.backend.cpu.simd import (
     broadcast,
     fetch_and_increment,
-    fma,
     iota,
     lanes,
     load,
     load_all,
-    load_double,
     prefetch,
     store,
     store_sums,
@@ -47,7 +45,7 @@ from splat.losses.cpu.window import both_ways, weighted
 from splat.losses.formulas import CENTRE, ssim_second_dot
 from splat.losses.reference import REACH, WINDOW, window
 from splat.render.cpu.footprints import FOOTPRINT
-from splat.render.cpu.tile import ACROSS, ALONG, MX, MY, PARAMS, SHEAR, STEP, column_u, row_range
+from splat.render.cpu.tile import ACROSS, ALONG, PARAMS, STEP, column_u, column_v, corner_of, row_range
 
 FACTORS = 3  # f: 1, 2 r, y - c
 FIELDS = 2 * FACTORS  # f D and f w
@@ -93,7 +91,7 @@ def find_spans(splat, frame, footprints, spans, weights, L):
     layout, begin, values = footprints
     y0, y1, done = frame.size, np.int64(-1), np.int64(-1)
     for a in range(layout.splat_start[splat], layout.splat_start[splat + 1]):
-        row, column = corner_of_tile(layout, a, frame, L)
+        column, row, _ = corner_of(layout.tiles[a], L, frame.columns, frame.stride)
         # rows down to the end of this row of tiles have no columns yet
         for y in range(row if done < 0 else done, row + TILE_HEIGHT):
             spans[y, 0], spans[y, 1] = frame.stride, -1
@@ -111,13 +109,6 @@ def find_spans(splat, frame, footprints, spans, weights, L):
                     spans[y, 0], spans[y, 1] = min(spans[y, 0], x), max(spans[y, 1], x)
                     y0, y1 = min(y0, y), max(y1, y)
     return y0, y1
-
-
-@formula
-def corner_of_tile(layout, a, frame, L):
-    """Row and column of the first pixel of an accumulator's tile."""
-    tile = np.int64(layout.tiles[a])
-    return tile // frame.columns * TILE_HEIGHT, tile % frame.columns * (L // PIXEL_ROWS)
 
 
 @formula
@@ -163,7 +154,7 @@ def fill_fields(splat, channel, box, frame, footprints, planes, fields, L):
     for at in range(0, (y1 - y0 + PIXEL_ROWS) * FIELDS * pitch, L):
         store(fields, at, 0.0)
     for a in range(layout.splat_start[splat], layout.splat_start[splat + 1]):
-        row, x = corner_of_tile(layout, a, frame, L)
+        x, row, _ = corner_of(layout.tiles[a], L, frame.columns, frame.stride)
         first, last = row_range(layout.rows[a])
         # the part of the tile that lies in the box
         if left - L // PIXEL_ROWS < x < left + vectors * L:
@@ -249,10 +240,9 @@ def add_windows(params, splat, y, x, first, last, frame, planes, work):
         E = weigh_row(E, load_all(rows, at, 4), g)
         F = weigh_row(F, load_all(rows, at + 4 * L, 4), g)
         G = weigh_row(G, load_all(rows, at + 8 * L, 4), g)
-    # the offset of the windows' centres, as in `tile.alpha_terms`
-    u, ratio = column_u(params, o, x, iota(params)), params[o + STEP] / params[o + ALONG]
-    dx, dy = x - load_double(params, o + MX), y - load_double(params, o + MY)
-    v = fma(iota(params), params[o + STEP], params[o + ACROSS] * (load_double(params, o + SHEAR) * dx + dy))
+    # the offset of the windows' centres
+    u, v = column_u(params, o, x, iota(params)), column_v(params, o, x, y, iota(params))
+    ratio = params[o + STEP] / params[o + ALONG]
     p, size = top + y * frame.stride + x, 3 * frame.size
     second = (
         load(seconds, p), load(seconds, p + size), load(seconds, p + 2 * size),

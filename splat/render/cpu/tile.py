@@ -153,26 +153,27 @@ def row_range(packed):
 
 @formula
 def column_u(params, o, x0, columns):
-    """u of columns, counted from x0; the mean is in double precision, as in `alpha_terms`."""
+    """u of columns, counted from x0; the mean is in double precision."""
     dx = x0 - load_double(params, o + MX)
     return fma(columns, params[o + ALONG], params[o + ALONG] * dx)
 
 
 @formula
-def alpha_terms(params, o, x0, y0):
-    """u of a tile's columns, and what gives v and log2 alpha of its rows: v of row 0, its step, log2 o - u^2, cut.
+def column_v(params, o, x0, y0, columns):
+    """v of columns, counted from x0, in row y0: far from the mean, v of a needle is a small difference of doubles."""
+    dx, dy = x0 - load_double(params, o + MX), y0 - load_double(params, o + MY)
+    return fma(columns, params[o + STEP], params[o + ACROSS] * (load_double(params, o + SHEAR) * dx + dy))
 
-    The offset of the tile's corner is in double precision: far from the mean, v of a needle is a small difference.
-    """
+
+@formula
+def alpha_terms(params, o, x0, y0):
+    """u of a tile's columns, and what gives v and log2 alpha of its rows: v of row 0, its step, log2 o - u^2, cut."""
     # whitened offset of a pixel (dx, dy): u = along dx, v = across (shear dx + dy)
     across = params[o + ACROSS]
-    # from the mean to the tile's corner
-    dx, dy = x0 - load_double(params, o + MX), y0 - load_double(params, o + MY)
     # the columns are 0, 1, ... pixels from the corner; a row of pixels adds `across` to v
     columns = pixel_columns(params)
     u = column_u(params, o, x0, columns)
-    v = fma(columns, params[o + STEP], across * (load_double(params, o + SHEAR) * dx + dy))
-    v = fma(pixel_rows(params), across, v)
+    v = fma(pixel_rows(params), across, column_v(params, o, x0, y0, columns))
     terms = (v, broadcast(params, across), fma(-u, u, params[o + LO]), broadcast(params, params[o + CUT]))
     return u, terms
 

@@ -126,7 +126,7 @@ def test_traces_are_exact_unless_samples_are_asked_for():
     for samples in (None, 8):
         settings = replace(few, trace_samples=samples)
         found = measure(objective, settings, steps(objective), torch.Generator().manual_seed(0), Stages()).traces
-        assert all((trace.reason == "exact") == (samples is None) for trace in found.values())
+        assert {(trace.probes, trace.reason == "exact") for trace in found.values()} == {(samples or 0, not samples)}
         for name, exact in block_traces(objective).items():
             assert found[name].value == exact.value or samples
             assert abs(found[name].value - exact.value) <= 6 * found[name].standard_error
