@@ -24,6 +24,7 @@ the device.
 
 from collections.abc import Callable, Iterator, Sequence
 from math import prod
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64
@@ -168,14 +169,17 @@ class LinearizedView:
         return self.block_diagonals(approximate=approximate, parts=(gauss_newton,))[0]
 
     def block_diagonals(
-        self, *, approximate: bool = False, parts: Sequence[bool] = (False, True)
+        self, *, approximate: bool = False, parts: Sequence[bool] = (False, True), space: list[Any] | None = None
     ) -> list[PerGaussianBlocks]:
-        """`block_diagonal` for each of parts (True: Gauss-Newton); they share the pass for the coupling of pixels."""
+        """`block_diagonal` for each of parts (True: Gauss-Newton); they share the pass for the coupling of pixels.
+
+        space: as of `Raster.coupled_blocks`.
+        """
         raster, index = self._raster, self._index
         if approximate or not self._couples:
             curvature, coupled = self._loss.diagonal, None
         else:
-            curvature, coupled = raster.coupled_blocks(self._loss, index)
+            curvature, coupled = raster.coupled_blocks(self._loss, index, [] if space is None else space)
         found = []
         for gauss_newton in parts:
             blocks = self._raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton)

@@ -218,8 +218,9 @@ class SceneObjective:
         """`block_diagonal` for each of parts (True: Gauss-Newton), which share passes over the pixels."""
         totals: list[PerGaussianBlocks] = []
         traces: list[list[dict[str, float]]] = []
+        space = []
         for done, view in enumerate(self.linearized, start=1):
-            found = view.block_diagonals(approximate=approximate, parts=parts)
+            found = view.block_diagonals(approximate=approximate, parts=parts, space=space)
             traces.append([each.traces(self.active.quats) if traced else {} for each in found])
             if done == 1:
                 totals = found

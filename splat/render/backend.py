@@ -136,11 +136,12 @@ class Raster(Protocol):
         ...
 
     def coupled_blocks(
-        self, loss: Any, index: Int[Tensor, " m"]
+        self, loss: Any, index: Int[Tensor, " m"], space: list[Any]
     ) -> tuple[Float[Tensor, "3 H W"], Float64[Tensor, "m 9 9"]]:
         """Of a loss that couples pixels, linearised: the pixelwise part of l'', and what the rest adds to the blocks at index.
 
-        index: ascending.  InputError where the device has no such kernel (`Backend.exact_blocks`).
+        index: ascending.  space: memory that views use one after the other, at first none.  InputError where the device has no
+        such kernel (`Backend.exact_blocks`).
         """
         ...
 

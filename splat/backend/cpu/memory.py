@@ -7,6 +7,7 @@ rows are transposed in registers, as many at a time as there are lanes:
                                                      l = last for l beyond it, and 0 for j from `count` on
     store_rows(a, at, k, last, count, block, row)    the other way; numbers from `count` on stay as they are
     neighbours(a, at)                                vectors of a[at + t], t = 1, ..., 5, -1, ..., -5; `at` aligned
+    neighbouring_products(a, at, b, place)           the same of a[at + t] b[place + t]
 
 A vector of pixels holds PIXEL_ROWS rows of pixels, one after the other:
 
@@ -148,17 +149,18 @@ def store_rows(typing, array, at, k, last, count, block, row):
     return types.void(array, at, k, last, count, block, row), generate
 
 
-@intrinsic
-def neighbours(typing, array, at):
+def _neighbours(dtype, addresses):
     """A vector across the border of two cache lines is slow to load: these are put together from three that are not."""
-    vector, steps = VectorType(array.dtype), [*range(1, 6), *range(-1, -6, -1)]
+    vector, steps = VectorType(dtype), [*range(1, 6), *range(-1, -6, -1)]
     many = types.UniTuple(vector, len(steps))
 
     def generate(context, builder, sig, args):
-        L, address = vector.lanes, address_of(context, builder, sig, args)
+        L, first, *second = vector.lanes, *addresses(context, builder, sig, args)
 
         def near(step):
-            value = load_at(builder, address, vector, step)
+            value = load_at(builder, first, vector, step)
+            for address in second:
+                value = builder.fmul(value, load_at(builder, address, vector, step))
             return builder.bitcast(value, vector.integers_ir)  # LLVM aligns integers alone in one instruction
 
         def shifted(step):
@@ -169,7 +171,23 @@ def neighbours(typing, array, at):
         values = [near(step) if max(steps) > L else shifted(step) for step in steps]
         return context.make_tuple(builder, many, [builder.bitcast(value, vector.llvm) for value in values])
 
+    return many, generate
+
+
+@intrinsic
+def neighbours(typing, array, at):
+    many, generate = _neighbours(array.dtype, lambda *call: [address_of(*call)])
     return many(array, at), generate
+
+
+@intrinsic
+def neighbouring_products(typing, array, at, other, place):
+    def addresses(context, builder, sig, args):
+        pairs = ((sig.args[i : i + 2], args[i : i + 2]) for i in (0, 2))
+        return [address_of(context, builder, types.void(*some), values) for some, values in pairs]
+
+    many, generate = _neighbours(array.dtype, addresses)
+    return many(array, at, other, place), generate
 
 
 def _parts(context, builder, sig, args, vector):

@@ -177,7 +177,7 @@ class CudaRaster:
         totals = self.totals(blocks.block_moments, 1, blocks.BLOCK_SUMS, v_planes, self.pad(curvature))[:, 0]
         return blocks.gaussian_blocks(totals[index], adjoint.moments[index], not gauss_newton)
 
-    def coupled_blocks(self, loss: object, index: Int[Tensor, " m"]) -> NoReturn:
+    def coupled_blocks(self, loss: object, index: Int[Tensor, " m"], space: list[object]) -> NoReturn:
         raise InputError(
             "expected Gaussians on the CPU for exact blocks of a loss with SSIM, got them on a GPU; move them there or ask for "
             "approximate ones"

@@ -25,8 +25,8 @@ from splat.losses.cpu.sweeps import (
     uncoupled_rows,
     uniform_rows,
 )
-from splat.losses.cpu.window import RING, Frame, moments_rows
-from splat.losses.formulas import KINDS, SECONDS
+from splat.losses.cpu.window import BORDER, RING, Frame, moments_rows
+from splat.losses.formulas import CENTRE, KINDS, SECONDS
 from splat.losses.protocols import require_planes
 from splat.losses.reference import REACH, LossSettings, beyond, window
 
@@ -37,11 +37,11 @@ NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 class Coupling(NamedTuple):
     """l'' = weight * sum over windows of M . seconds M, M a window's means of v, 2 r v and (y - c) v, plus uncoupled v^2.
 
-    image, target, uncoupled: three flat planes; seconds: see `sweeps.py`.
+    factors: 2 r and y - c, three flat planes each, with BORDER numbers before and behind both; uncoupled: three flat planes;
+    seconds: see `sweeps.py`.
     """
 
-    image: np.ndarray
-    target: np.ndarray
+    factors: np.ndarray
     seconds: np.ndarray
     weight: float
     uncoupled: np.ndarray
@@ -222,7 +222,12 @@ class CpuLinearLoss:
         uncoupled[:, :, loss.frame.height :] = 0
         images = image, target, self._blurred
         over_range(3 * loss.frame.height, uncoupled_rows, loss.frame, loss.loss, *images, uncoupled.reshape(-1))
-        return Coupling(image, target, self._seconds, -loss.structural, uncoupled.reshape(-1))
+        factors = np.zeros(2 * (image.size + BORDER), loss.dtype)
+        doubled, centred = factors[BORDER:-BORDER].reshape(2, -1)
+        np.subtract(image, target, out=doubled)
+        doubled *= 2
+        np.subtract(target, CENTRE, out=centred)
+        return Coupling(factors, self._seconds, -loss.structural, uncoupled.reshape(-1))
 
     @cached_property
     def diagonal(self) -> Float[Tensor, "3 H W"]:

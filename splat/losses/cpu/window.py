@@ -118,14 +118,14 @@ def blur_along(rows, fields, frame, ring, first, y):
     for field in range(fields):
         begin = begin_of(rows, field, frame)
         for i in range(0, frame.stride, lanes(rows)):
-            blurred = weighted(load(rows, begin + i), both_ways(rows, begin + i)[0], frame.taps)
+            blurred = weighted(load(rows, begin + i), both_ways(neighbours(rows, begin + i))[0], frame.taps)
             store(ring, ring_at(ring, first + field, y, i, frame), blurred)
 
 
 @formula
-def both_ways(array, at):
-    """F(x + t) + F(x - t) and F(x + t) - F(x - t) for t = 1 to 5."""
-    p1, p2, p3, p4, p5, m1, m2, m3, m4, m5 = neighbours(array, at)
+def both_ways(near):
+    """F(x + t) + F(x - t) and F(x + t) - F(x - t) for t = 1 to 5; near: of `neighbours`."""
+    p1, p2, p3, p4, p5, m1, m2, m3, m4, m5 = near
     return (p1 + m1, p2 + m2, p3 + m3, p4 + m4, p5 + m5), (p1 - m1, p2 - m2, p3 - m3, p4 - m4, p5 - m5)
 
 

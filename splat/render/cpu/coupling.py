@@ -15,21 +15,21 @@ So the slopes' M are those of D's moments in a window, times powers of u and v a
     blur(u F) = u B_00 + B_10             blur(u^2 F) = u^2 B_00 + 2 u B_10 + B_20
     blur(v F) = v B_00 + r B_10 + B_01    and so on (`slopes_of`)
 
-The blur is separable: each row of a splat's fields F and f w is blurred along itself with the powers of a t, and these down the
-columns with those of b s, a strip of windows, `lanes` wide, at a time.  Rows without weight are left out.  Fields take 24 bytes
-a pixel of a splat's box in single precision.  Sums are moved to double precision every FLUSH rows.  Three tuples go through:
+The blur is separable: each row of a splat's F and f w is blurred along itself with the powers of a t, and these down the
+columns with those of b s, a strip of windows, `lanes` wide, at a time.  Rows without weight are left out.  Sums are moved to
+double precision every FLUSH rows.  Three tuples go through:
 
     footprints   (layout, begin, values): `Footprints`, and w and D of the accumulators from begin on (`find_footprints`)
-    planes       (image, target, seconds, index of the channel's first pixel): of `losses.cpu.loss.Coupling`
-    work         (fields, rows, taps, spans, sums): the fields of a splat's box; a strip of them, blurred along its rows;
-                 g_s (b s)^j; the splat's first and last column in each row; sums by lane
+    planes       (factors, seconds, index of the channel's first pixel): of `losses.cpu.loss.Coupling`
+    work         (fields, rows, taps, spans, sums): w and D in a splat's box, side by side in each row; a strip, blurred along
+                 its rows; g_s (b s)^j; the splat's first and last column in each row; sums by lane
 """
 
 import numpy as np
 import torch
 
 from splat.backend.cpu.jit import formula, kernel
-from splat.backend.cpu.memory import PIXEL_ROWS, TILE_HEIGHT, load_pixels, scratch, store_pixels
+from splat.backend.cpu.memory import PIXEL_ROWS, neighbouring_products, neighbours, scratch, store_pixels
 from splat.backend.cpu.simd import (
     broadcast,
     fetch_and_increment,
@@ -41,19 +41,17 @@ from splat.backend.cpu.simd import (
     store,
     store_sums,
 )
-from splat.losses.cpu.window import both_ways, weighted
-from splat.losses.formulas import CENTRE, ssim_second_dot
+from splat.losses.cpu.window import BORDER, both_ways, weighted
+from splat.losses.formulas import ssim_second_dot
 from splat.losses.reference import REACH, WINDOW, window
 from splat.render.cpu.footprints import FOOTPRINT
 from splat.render.cpu.tile import ACROSS, ALONG, PARAMS, STEP, column_u, column_v, corner_of, row_range
 
-FACTORS = 3  # f: 1, 2 r, y - c
-FIELDS = 2 * FACTORS  # f D and f w
-BLURRED = 4 * FACTORS  # along a row: f D with the powers 0, 1, 2 of a t, and f w
+BLURRED = 4 * 3  # along a row, for each of three f: f D with the powers 0, 1, 2 of a t, and f w
 SLOPES = 7  # of a channel in a splat's numbers, in the order of its block: six of geometry, one of colour
 PAIRS = SLOPES * (SLOPES + 1) // 2
+MARGIN = 48  # zeros between rows of fields: at least 2 lanes - 1 and REACH
 AHEAD = 3  # rows of windows between a prefetch and its use; of a footprint twice as many vectors
-EDGE = 16  # floats of padding at either side of a row: at least a vector, and REACH
 FLUSH = 16  # rows
 TAPS = tuple(float(tap) for tap in window(torch.float64)[REACH:])
 # taps with the powers 1 and 2 of t, without the middle ones, which are 0
@@ -61,10 +59,10 @@ FIRST, SECOND = (tuple(k**power * tap for k, tap in enumerate(TAPS) if k) for po
 
 
 @kernel
-def coupled_blocks(counter, order, index, params, frame, footprints, image, target, seconds, weight, blocks):
+def coupled_blocks(counter, order, index, params, frame, footprints, factors, seconds, weight, blocks):
     """Add weight times sum M . S'' M' to the blocks (m, 9, 9) of the splats at index; order: of its elements, those to do."""
     L, height = lanes(params), frame.size // frame.stride
-    fields = scratch(params, FIELDS * height * (frame.stride + 2 * EDGE))
+    fields = scratch(params, FOOTPRINT * height * (frame.stride + MARGIN) + 2 * MARGIN)
     rows, taps = scratch(params, BLURRED * height * L), scratch(params, 3 * WINDOW * L)
     spans, weights = np.empty((height, 2), np.int64), scratch(params, L)
     sums, part, total = scratch(params, PAIRS * L), np.empty(PAIRS, params.dtype), np.empty(PAIRS)
@@ -73,53 +71,67 @@ def coupled_blocks(counter, order, index, params, frame, footprints, image, targ
     turn = fetch_and_increment(counter)
     while turn < order.size:
         splat = index[order[turn]]
-        y0, y1 = find_spans(splat, frame, footprints, spans, weights, L)
+        origin, pitch, y0, y1 = fill_fields(splat, frame, footprints, fields, spans, weights, L)
         if y0 <= y1:
-            box = box_of_windows(spans, y0, y1, frame, L)
+            box = (origin, pitch, y0, y1, *columns_of_windows(spans, y0, y1, frame, L))
             fill_taps(taps, params[splat * PARAMS + ACROSS], L)
             for channel in range(3):
-                planes = (image, target, seconds, channel * frame.size)
-                fill_fields(splat, channel, box, frame, footprints, planes, fields, L)
-                sum_windows(params, splat, box, frame, planes, work, part, total)
+                planes = (factors, seconds, channel * frame.size)
+                sum_windows(params, splat, channel, box, frame, planes, work, part, total)
                 add_to_block(total, weight, channel, blocks[order[turn]])
         turn = fetch_and_increment(counter)
 
 
 @formula
-def find_spans(splat, frame, footprints, spans, weights, L):
-    """First and last row in which a splat has weight; fills spans (see `work`).  weights: space for a vector."""
+def fill_fields(splat, frame, footprints, fields, spans, weights, L):
+    """Write w and D of a splat row by row, 0 where it has no weight, and the columns of each row that has to spans.
+
+    Returns the place of pixel (0, 0), the numbers from a field to the next, and the first and last row with weight.
+    weights: space for a vector.
+    """
     layout, begin, values = footprints
-    y0, y1, done = frame.size, np.int64(-1), np.int64(-1)
+    left, right, top, bottom = frame.stride, 0, frame.size, 0
+    # the box of the splat's tiles
     for a in range(layout.splat_start[splat], layout.splat_start[splat + 1]):
         column, row, _ = corner_of(layout.tiles[a], L, frame.columns, frame.stride)
-        # rows down to the end of this row of tiles have no columns yet
-        for y in range(row if done < 0 else done, row + TILE_HEIGHT):
-            spans[y, 0], spans[y, 1] = frame.stride, -1
-        done = row + TILE_HEIGHT
-        top, bottom = row_range(layout.rows[a])
-        for k in range(top, bottom):
-            at = (layout.place[a] - layout.place[begin] + k - top) * FOOTPRINT * L
-            for vector in range(FOOTPRINT):
-                prefetch(values, at + (2 * AHEAD * FOOTPRINT + vector) * L)
+        first, last = row_range(layout.rows[a])
+        left, right = min(left, column), max(right, column + L // PIXEL_ROWS)
+        top, bottom = min(top, row + PIXEL_ROWS * first), max(bottom, row + PIXEL_ROWS * last)
+    pitch = right - left + MARGIN
+    for at in range(0, (bottom - top) * FOOTPRINT * pitch + MARGIN, L):
+        store(fields, at, 0.0)
+    for y in range(top, bottom):
+        spans[y, 0], spans[y, 1] = frame.stride, -1
+    origin, y0, y1 = MARGIN - left - top * FOOTPRINT * pitch, bottom, top - 1
+    for a in range(layout.splat_start[splat], layout.splat_start[splat + 1]):
+        column, row, _ = corner_of(layout.tiles[a], L, frame.columns, frame.stride)
+        first, last = row_range(layout.rows[a])
+        at = (layout.place[a] - layout.place[begin]) * FOOTPRINT * L
+        for y in range(row + PIXEL_ROWS * first, row + PIXEL_ROWS * last, PIXEL_ROWS):
+            to = origin + y * FOOTPRINT * pitch + column
             store(weights, 0, load(values, at))
+            for field in range(FOOTPRINT):
+                prefetch(values, at + 2 * AHEAD * FOOTPRINT * L)
+                store_pixels(fields, to + field * pitch, FOOTPRINT * pitch, load(values, at))
+                at += L
             # widen the rows' spans by the pixels with weight
             for lane in range(L):
-                x, y = column + lane % (L // PIXEL_ROWS), row + PIXEL_ROWS * k + lane // (L // PIXEL_ROWS)
                 if weights[lane] > 0:
-                    spans[y, 0], spans[y, 1] = min(spans[y, 0], x), max(spans[y, 1], x)
-                    y0, y1 = min(y0, y), max(y1, y)
-    return y0, y1
+                    x, line = column + lane % (L // PIXEL_ROWS), y + lane // (L // PIXEL_ROWS)
+                    spans[line, 0], spans[line, 1] = min(spans[line, 0], x), max(spans[line, 1], x)
+                    y0, y1 = min(y0, line), max(y1, line)
+    return origin, pitch, y0, y1
 
 
 @formula
-def box_of_windows(spans, y0, y1, frame, L):
-    """First and last row of a splat, first column of its windows, and the number of vectors that their columns take."""
+def columns_of_windows(spans, y0, y1, frame, L):
+    """First column of a splat's windows, and the number of vectors that their columns take."""
     lo, hi = spans[y0, 0], spans[y0, 1]
     for y in range(y0 + 1, y1 + 1):
         lo, hi = min(lo, spans[y, 0]), max(hi, spans[y, 1])
     left = max(lo - REACH, 0)
     vectors = (min(hi + REACH, frame.width - 1) - left) // L + 1
-    return y0 - y0 % PIXEL_ROWS, y1, min(left, frame.stride - vectors * L), vectors
+    return min(left, frame.stride - vectors * L), vectors
 
 
 @formula
@@ -145,50 +157,23 @@ def add_to_block(total, weight, channel, block):
 
 
 @formula
-def fill_fields(splat, channel, box, frame, footprints, planes, fields, L):
-    """Write the fields of a splat, row by row: f D and f w of each factor, 0 where it has no weight."""
-    image, target, _seconds, top = planes
-    layout, begin, values = footprints
-    y0, y1, left, vectors = box
-    pitch = vectors * L + 2 * EDGE
-    for at in range(0, (y1 - y0 + PIXEL_ROWS) * FIELDS * pitch, L):
-        store(fields, at, 0.0)
-    for a in range(layout.splat_start[splat], layout.splat_start[splat + 1]):
-        x, row, _ = corner_of(layout.tiles[a], L, frame.columns, frame.stride)
-        first, last = row_range(layout.rows[a])
-        # the part of the tile that lies in the box
-        if left - L // PIXEL_ROWS < x < left + vectors * L:
-            for y in range(max(row + PIXEL_ROWS * first, y0), min(row + PIXEL_ROWS * last, y1 + 1), PIXEL_ROWS):
-                where = (layout.place[a] - layout.place[begin] + (y - row) // PIXEL_ROWS - first) * FOOTPRINT * L
-                w, D = load(values, where), load(values, where + (1 + channel) * L)
-                p, to = top + y * frame.stride + x, (y - y0) * FIELDS * pitch + EDGE + x - left
-                photo = load_pixels(target, p, frame.stride)
-                residual, aim = 2.0 * (load_pixels(image, p, frame.stride) - photo), photo - CENTRE
-                # a row of pixels to the next one: all fields
-                store_all_pixels(fields, to, pitch, (D, w, residual * D, residual * w, aim * D, aim * w))
+def sum_windows(params, splat, channel, box, frame, planes, work, part, total):
+    """Write the sum of a channel's M . S'' M' over all windows to total (PAIRS,).
 
-
-@formula
-def store_all_pixels(fields, to, pitch, values):
-    """Store vectors of pixels in the fields at `to`."""
-    for k in range(len(values)):
-        store_pixels(fields, to + k * pitch, FIELDS * pitch, values[k])
-
-
-@formula
-def sum_windows(params, splat, box, frame, planes, work, part, total):
-    """Write the sum of a channel's M . S'' M' over all windows to total (PAIRS,).  box: of `box_of_windows`; part: space."""
+    box: of `fill_fields` and `columns_of_windows`; part: space.
+    """
     fields, rows, _taps, spans, sums = work
-    y0, y1, left, vectors = box
-    L = lanes(params)
-    pitch, unflushed = vectors * L + 2 * EDGE, 0
+    (origin, pitch, y0, y1, left, vectors), (factors, _seconds, top) = box, planes
+    L, unflushed = lanes(params), 0
     along = broadcast(params, params[splat * PARAMS + ALONG])
     sums[:], total[:] = 0, 0
     for x in range(0, vectors * L, L):
         # rows with pixels that the windows of this strip can see
         first, last = reach_of(spans, y0, y1, left + x - REACH, left + x + L - 1 + REACH)
         for y in range(first, last + 1):
-            blur_row(fields, (y - y0) * FIELDS * pitch + EDGE + x, pitch, along, rows, (y - first) * BLURRED * L)
+            at, p = origin + y * FOOTPRINT * pitch + left + x, BORDER + top + y * frame.stride + left + x
+            D = at + (1 + channel) * pitch
+            blur_row(fields, at, D, factors, p, 3 * frame.size, along, rows, (y - first) * BLURRED * L)
         # the windows' centres
         for y in range(max(first - REACH, 0), min(last + REACH + 1, frame.height)):
             add_windows(params, splat, y, left + x, first, last, frame, planes, work)
@@ -215,22 +200,33 @@ def dot5(x, taps):
 
 
 @formula
-def blur_row(fields, at, pitch, along, rows, to):
-    """Blur the fields at `at` along their row, to rows at `to`: of each factor f D with the powers 0, 1, 2 of a t, and f w."""
+def blur_row(fields, w, D, factors, p, size, along, rows, to):
+    """Blur w, D and their products with the factors at p along their row, to rows at `to`.  size: from a factor to the next."""
     L = lanes(fields)
-    for _ in range(FACTORS):
-        s, d = both_ways(fields, at)
-        store(rows, to, weighted(load(fields, at), s, TAPS))
-        store(rows, to + L, along * dot5(d, FIRST))
-        store(rows, to + 2 * L, along * along * dot5(s, SECOND))
-        store(rows, to + 3 * L, weighted(load(fields, at + pitch), both_ways(fields, at + pitch)[0], TAPS))
-        at, to = at + 2 * pitch, to + 4 * L
+    blur_moments(load(fields, D), both_ways(neighbours(fields, D)), along, rows, to)
+    store(rows, to + 3 * L, weighted(load(fields, w), both_ways(neighbours(fields, w))[0], TAPS))
+    for _ in range(2):
+        to, f = to + 4 * L, load(factors, p)
+        blur_moments(load(fields, D) * f, both_ways(neighbouring_products(fields, D, factors, p)), along, rows, to)
+        s, _d = both_ways(neighbouring_products(fields, w, factors, p))
+        store(rows, to + 3 * L, weighted(load(fields, w) * f, s, TAPS))
+        p += size
+
+
+@formula
+def blur_moments(middle, pairs, along, rows, to):
+    """Store the window's sums with the powers 0, 1 and 2 of a t; pairs: see `both_ways`."""
+    L = lanes(rows)
+    s, d = pairs
+    store(rows, to, weighted(middle, s, TAPS))
+    store(rows, to + L, along * dot5(d, FIRST))
+    store(rows, to + 2 * L, along * along * dot5(s, SECOND))
 
 
 @formula
 def add_windows(params, splat, y, x, first, last, frame, planes, work):
     """Add M . S'' M' of the windows centred in row y, from column x on, to the sums; first, last: rows with weight."""
-    _image, _target, seconds, top = planes
+    _factors, seconds, top = planes
     _fields, rows, taps, _spans, sums = work
     L, o, zero = lanes(params), splat * PARAMS, broadcast(params, 0.0)
     # down the columns: B_00, B_10, B_20, B_01, B_11, B_02 and w of each factor

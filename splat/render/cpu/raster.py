@@ -143,7 +143,7 @@ class CpuRaster:
         return torch.from_numpy(found)
 
     def coupled_blocks(
-        self, loss: CpuLinearLoss, index: Int[Tensor, " m"]
+        self, loss: CpuLinearLoss, index: Int[Tensor, " m"], space: list[np.ndarray]
     ) -> tuple[Float[Tensor, "3 H W"], Float64[Tensor, "m 9 9"]]:
         """Footprints are kept for as many splats at a time as FOOTPRINT_BYTES allow, but for one at least."""
         coupled = loss.coupling()
@@ -156,14 +156,17 @@ class CpuRaster:
             begin = splat_start[splats[start]]
             stop = max(int(np.searchsorted(ends, layout.place[begin] + most, side="right")), start + 1)
             end = splat_start[splats[stop - 1] + 1]
-            values = aligned((int(layout.place[end] - layout.place[begin]) * row,), self.dtype)
+            size = int(layout.place[end] - layout.place[begin]) * row
+            if not space or space[0].size < size:
+                space[:] = [aligned((max(size, most * row),), self.dtype)]  # pages count once they are written
+            values = space[0]
             view = (self.params, lists, self.frame, self.pixels)
             over_tiles(footprints.find_footprints, *view, layout, begin, end, values)
             # neighbours one after the other: the pixels under them stay in the cache
             order = start + np.argsort(layout.tiles[splat_start[splats[start:stop]]], kind="stable")
             over_tiles(
                 coupling.coupled_blocks, order, splats, self.params, self.frame, (layout, begin, values), *coupled[:3],
-                coupled.weight, blocks,
+                blocks,
             )  # fmt: skip
             start = stop
         return torch.from_numpy(coupled.uncoupled).view(3, *self.plane), torch.from_numpy(blocks)
