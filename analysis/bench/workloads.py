@@ -172,7 +172,7 @@ class ViewBench:
 
     def _block_diagonal(self) -> PerGaussianBlocks:
         vars(self.linearized._loss).pop("diagonal", None)  # it keeps the loss's share, which is part of the cost
-        return self.linearized.block_diagonal(approximate=True)
+        return self.linearized.block_diagonals(approximate=True, parts=(False,))[0]
 
     def workspace(self, K: int, meter: Meter) -> int:
         """Bytes that a product with K vectors allocates at most at a time, its result included."""

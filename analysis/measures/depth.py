@@ -35,6 +35,7 @@ from landscape.probes import draw_probes
 from landscape.results import Bracket, Progress, finite_or_none, mean_of_parts
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import TraceSettings
+from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import ONE_PERCENT, SampledTrace, sampled_traces
 
@@ -83,13 +84,14 @@ def _ratio(components: Float64[Tensor, "pairs 2"]) -> float:
 
 def gradient_ratio(objective: SceneObjective) -> float:
     """`DepthSplit.gradient_ratio` alone, of one gradient for each view."""
-    rays = (rays_of(objective, index) for index in range(len(objective.views)))
-    rows = objective.blocks["means"]
-    parts = [
-        along_and_across(view.gradient[rows].view(-1, 3), ray)
-        for view, ray in zip(objective.linearized, rays, strict=True)
-    ]
-    return _ratio(torch.stack(parts, dim=1).flatten(0, 1).double())
+    return _ratio(_components(objective))
+
+
+def _components(objective: SceneObjective) -> Float64[Tensor, "pairs 2"]:
+    """`along_and_across` of the positions' gradient in every view."""
+    gradients = [view.gradient[objective.blocks["means"]].view(-1, 3) for view in objective.linearized]
+    parts = [along_and_across(gradient, objective.rays(index)) for index, gradient in enumerate(gradients)]
+    return torch.stack(parts, dim=1).flatten(0, 1)
 
 
 def measure_depth(
@@ -98,9 +100,10 @@ def measure_depth(
     steps: tuple[float, ...],
     generator: torch.Generator,
     report: Progress,
+    exact: bool,
 ) -> Depth:
-    """The stage `depth` of a probe.  steps: px."""
-    found = depth_split(objective, generator, traces, report)
+    """The stage `depth` of a probe.  steps: px; exact: see `depth_split`."""
+    found = depth_split(objective, generator, traces, report, exact)
     rises = depth_rises(objective, generator, steps, progress=report)
     return convert(
         {
@@ -120,22 +123,19 @@ def depth_split(
     generator: torch.Generator,
     settings: TraceSettings = ONE_PERCENT,
     progress: Progress | None = None,
+    exact: bool = False,
 ) -> DepthSplit:
-    """Gradient and curvature of the active Gaussians' positions.  settings: as for `exact_traces`, for either trace."""
-    rays = [rays_of(objective, index) for index in range(len(objective.views))]
-    parts = (False, True) if objective.couples_pixels else (False,)  # the blocks whole, and pixel by pixel
-    components, sums = [], torch.zeros(len(KINDS), len(parts), dtype=torch.float64)
-    for ray, view in zip(rays, objective.linearized, strict=True):
-        components.append(along_and_across(view.gradient[objective.blocks["means"]].view(-1, 3), ray))
-        for part, gauss_newton in enumerate(parts):
-            blocks = view.block_diagonal(gauss_newton=gauss_newton, approximate=True).geometry
-            sums[:, part] += _split_traces(blocks[:, :3, :3], ray).cpu()
-    pairs = torch.stack(components, dim=1).flatten(0, 1)
-    dims = (len(objective.active), LATERAL_DIRECTIONS * len(objective.active))
-    found, counts = (sums / len(objective.views)).tolist(), (settings.min_probes, settings.max_probes)
+    """Gradient and curvature of the active Gaussians' positions.
+
+    settings: as for `exact_traces`, for either trace.  exact: sums over exact blocks in place of samples, on a CPU.
+    """
+    rays = [objective.rays(index) for index in range(len(objective.views))]
+    pairs = _components(objective)
+    whole, pixelwise = (objective.exact_blocks, None) if exact else objective.approximate_blocks
+    counts, n = (settings.min_probes, settings.max_probes), len(objective.active)
     traces = [
-        SampledTrace(kind, dim, known, pixelwise[0] if pixelwise else None, settings, *counts)
-        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, found, strict=True)
+        SampledTrace(kind, dim, _mean(whole, kind), pixelwise and _mean(pixelwise, kind), settings, *counts)
+        for kind, dim in zip(KINDS, (n, LATERAL_DIRECTIONS * n), strict=True)
     ]
     estimates = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
     return DepthSplit(pairs[pairs.any(dim=1)], **estimates)
@@ -178,12 +178,6 @@ def depth_rises(
     return [convert({"pixels": step, **row}, Rise) for step, row in zip(steps, rows, strict=True)]
 
 
-def rays_of(objective: SceneObjective, index: int) -> Float[Tensor, "n 3"]:
-    """v of every active Gaussian in the view with this index in `objective.views`."""
-    means = objective.active.means
-    return F.normalize(means - objective.views[index].camera.centre.to(means), dim=1)
-
-
 def along_and_across(vectors: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float64[Tensor, "n 2"]:
     """Lengths of the components of vectors along and across their rays.
 
@@ -198,11 +192,8 @@ def _across(vectors: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float[
     return vectors - (vectors * rays).sum(dim=1, keepdim=True) * rays
 
 
-def _split_traces(blocks: Float[Tensor, "n 3 3"], rays: Float[Tensor, "n 3"]) -> Float64[Tensor, "2"]:
-    """Sums of v^T H v and of tr H - v^T H v."""
-    H, v = blocks.double(), rays.double()
-    depth = (v[:, None, :] @ H @ v[:, :, None]).sum()
-    return torch.stack([depth, H.diagonal(dim1=1, dim2=2).sum() - depth])
+def _mean(blocks: PerGaussianBlocks, kind: str) -> float:
+    return sum(view[kind] for view in blocks.views) / len(blocks.views)
 
 
 def _signs(
@@ -227,7 +218,7 @@ def _directions(
     objective: SceneObjective, index: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Steps along and across the rays, of the length that is a pixel wide at the mean."""
-    ray, camera, means = rays_of(objective, index), objective.views[index].camera, objective.active.means
+    ray, camera, means = objective.rays(index), objective.views[index].camera, objective.active.means
     pixel = (means - camera.centre.to(means)).norm(dim=1, keepdim=True) / float(camera.fx)
     z = draw_probes(4 * len(ray), 1, generator, torch.float64, "gaussian").view(-1, 4).to(means)
     return z[:, :1].sign() * ray * pixel, F.normalize(_across(z[:, 1:], ray), dim=1) * pixel

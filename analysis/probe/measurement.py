@@ -285,7 +285,7 @@ def _rendered(
 
 
 def _depth(at: _Point, accuracy: TraceSettings, generator: torch.Generator, report: Progress, _: list[str]) -> Depth:
-    return measure_depth(at.objective, accuracy, at.settings.depth_steps, generator, report)
+    return measure_depth(at.objective, accuracy, at.settings.depth_steps, generator, report, at.exact_blocks)
 
 
 def _plane(

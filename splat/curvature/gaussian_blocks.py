@@ -21,7 +21,7 @@ GEOMETRY_COLUMNS = {
 class PerGaussianBlocks(ShortRepr):
     """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH.
 
-    views: for a mean over views, the `traces` of each view's blocks; else empty.
+    views: for a mean over views, the `traces` of each view's blocks, and those `by_rays`; else empty.
     """
 
     geometry: Float[Tensor, "n 11 11"]
@@ -49,6 +49,12 @@ class PerGaussianBlocks(ShortRepr):
             units = scale.attributes
             diagonals = {name: part * units[name].double().view_as(part).square() for name, part in diagonals.items()}
         return {name: float(part.sum()) for name, part in diagonals.items()}
+
+    def by_rays(self, rays: Float[Tensor, "n 3"]) -> dict[str, float]:
+        """Traces of the means' blocks H along rays v, v^T H v ("depth"), and across them, tr H - v^T H v ("lateral")."""
+        H, v = self.geometry[:, :3, :3].double(), rays.double()
+        depth = float((v[:, None, :] @ H @ v[:, :, None]).sum())
+        return {"depth": depth, "lateral": float(H.diagonal(dim1=1, dim2=2).sum()) - depth}
 
     @property
     def diagonals(self) -> dict[str, Float64[Tensor, "n ..."]]:

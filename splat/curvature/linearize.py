@@ -90,7 +90,7 @@ class LinearizedView:
 
     @staticmethod
     def size_of(raster: Raster, gaussians: Gaussians, settings: RenderSettings) -> tuple[int, int, int]:
-        """Estimates, for a view with this raster, of `bytes`, `workspace(1)` and the bytes that `block_diagonal` takes."""
+        """Estimates, for a view with this raster, of `bytes`, `workspace(1)` and the bytes that `block_diagonals` takes."""
         size, drawn = gaussians.flat.element_size(), len(raster.touched)
         plane = raster.planes[0].nbytes
         rows = row_shapes(antialiased=settings.antialias != "none" or gaussians.filter_widths is not None)
@@ -160,20 +160,13 @@ class LinearizedView:
         cotangents = self._loss_product(self._tangent(U), ssim_window)
         return self._pullback([self._raster.backward(cotangent) for cotangent in cotangents], total)
 
-    def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
-        """The diagonal block of every Gaussian in the Hessian, or in its Gauss-Newton part.
-
-        approximate: with the pixel-diagonal of l'' in place of l'', which takes one pass over the pixels.  Exact blocks of a
-        loss with SSIM, which couples pixels, are computed on the CPU only (InputError on a GPU).
-        """
-        return self.block_diagonals(approximate=approximate, parts=(gauss_newton,))[0]
-
     def block_diagonals(
         self, *, approximate: bool = False, parts: Sequence[bool] = (False, True), space: list[Any] | None = None
     ) -> list[PerGaussianBlocks]:
-        """`block_diagonal` for each of parts (True: Gauss-Newton); they share the pass for the coupling of pixels.
+        """The diagonal blocks of the Hessian (False) or of its Gauss-Newton part (True), for each of parts; they share a pass.
 
-        space: as of `Raster.coupled_blocks`.
+        approximate: with the pixel-diagonal of l'' in place of l''.  Exact blocks of a loss with SSIM, which couples pixels,
+        are made on a CPU only (InputError on a GPU).  space: as of `Raster.coupled_blocks`.
         """
         raster, index = self._raster, self._index
         if approximate or not self._couples:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
@@ -197,6 +198,11 @@ class SceneObjective:
             total += view.gradient
         return total / len(self.views)
 
+    def rays(self, index: int) -> Float[Tensor, "n 3"]:
+        """Unit vectors from the centre of a view's camera to the means of the active Gaussians, as in Eq. (7)."""
+        means = self.active.means
+        return F.normalize(means - self.views[index].camera.centre.to(means), dim=1)
+
     def block_diagonal(
         self, *, gauss_newton: bool = False, approximate: bool = False, traced: bool = True
     ) -> PerGaussianBlocks:
@@ -221,7 +227,8 @@ class SceneObjective:
         space = []
         for done, view in enumerate(self.linearized, start=1):
             found = view.block_diagonals(approximate=approximate, parts=parts, space=space)
-            traces.append([each.traces(self.active.quats) if traced else {} for each in found])
+            quats, rays = self.active.quats, self.rays(done - 1)
+            traces.append([each.traces(quats) | each.by_rays(rays) if traced else {} for each in found])
             if done == 1:
                 totals = found
             else:

@@ -144,7 +144,7 @@ def _squares(
     nothing = torch.zeros(3, camera.height, camera.width)
     loss = backend_of(gaussians.flat).view_loss(nothing, LossSettings("l2", ssim_weight=0), gaussians.flat)
     view = LinearizedView(gaussians, camera, loss, background.to(gaussians.flat), settings)
-    blocks, pixels = view.block_diagonal(gauss_newton=True), 1.5 * camera.height * camera.width
+    blocks, pixels = view.block_diagonals(parts=(True,))[0], 1.5 * camera.height * camera.width
     return PerGaussianBlocks(pixels * blocks.geometry, pixels * blocks.sh)
 
 

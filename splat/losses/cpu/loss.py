@@ -223,10 +223,7 @@ class CpuLinearLoss:
         images = image, target, self._blurred
         over_range(3 * loss.frame.height, uncoupled_rows, loss.frame, loss.loss, *images, uncoupled.reshape(-1))
         factors = np.zeros(2 * (image.size + BORDER), loss.dtype)
-        doubled, centred = factors[BORDER:-BORDER].reshape(2, -1)
-        np.subtract(image, target, out=doubled)
-        doubled *= 2
-        np.subtract(target, CENTRE, out=centred)
+        factors[BORDER:-BORDER] = np.concatenate([2 * (image - target), target - CENTRE])
         return Coupling(factors, self._seconds, -loss.structural, uncoupled.reshape(-1))
 
     @cached_property

@@ -7,16 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from analysis.measures.depth import (
-    KINDS,
-    DepthSplit,
-    _directions,
-    _signs,
-    depth_rises,
-    depth_split,
-    gradient_ratio,
-    rays_of,
-)
+from analysis.measures.depth import KINDS, DepthSplit, _directions, _signs, depth_rises, depth_split, gradient_ratio
 from analysis.records.schema import Rise
 from landscape.results import t_quantile
 from landscape.traces.estimate import TraceEstimate
@@ -79,6 +70,9 @@ def test_with_ssim_both_traces_are_within_their_errors_over_many_seeds():
     objective = objective_of(random_gaussians(8, sh_degree=1, seed=4, logit=1.0), loss)
     _, traces = by_specification(objective, loss)
     found = [depth_split(objective, generator(seed), TraceSettings.fixed(12)) for seed in range(seeds)]
+    exact = depth_split(objective, generator(), exact=True)
+    assert [exact.depth.value, exact.lateral.value] == pytest.approx(traces.tolist(), rel=1e-9)
+    assert exact.depth.reason == exact.lateral.reason == "exact"
     for name, truth in zip(KINDS, traces.tolist(), strict=True):
         estimates = [getattr(split, name) for split in found]
         z = torch.tensor([(estimate.value - truth) / estimate.standard_error for estimate in estimates])
@@ -112,7 +106,7 @@ def test_steps_are_along_the_rays_or_across_them_and_as_long_as_a_pixel(objectiv
 
 
 def test_probes_have_signs_along_the_rays_or_across_them(objective):
-    rays = [rays_of(objective, index) for index in range(2)]
+    rays = [objective.rays(index) for index in range(2)]
     for index, ray in enumerate(rays):
         U = _signs(objective, rays, index, [generator(0), generator(1)], KINDS)
         means, others = U[objective.blocks["means"]].view(-1, 3, 2, 2), U[objective.blocks["means"].stop :]

@@ -126,8 +126,8 @@ def test_positions_are_split_along_and_across_the_rays(record, dense):
     assert found.pairs == len(split.components) <= len(objective.active) * len(objective.views)
     depth, lateral = found.curvature["depth"], found.curvature["lateral"]
     whole = record.data.traces["means"]
-    error = math.hypot(*(trace.standard_error for trace in (depth, lateral, whole)))
-    assert abs(depth.value + lateral.value - whole.value) < 5 * error
+    assert (depth.reason, lateral.reason) == ("exact", "exact")
+    assert depth.value + lateral.value == pytest.approx(whole.value, rel=1e-9)
     assert found.curvature_ratio.value == pytest.approx(2 * depth.value / lateral.value, rel=1e-12)
     assert [row.pixels for row in found.rises] == list(STEPS)
     for row in found.rises:

@@ -75,7 +75,7 @@ def test_all_that_a_view_on_the_gpu_gives_is_what_one_on_the_cpu_gives(device, m
     def everything(gaussians: Gaussians) -> list[Tensor]:
         loss = backend_of(gaussians.flat).view_loss(view.image, LOSS, gaussians.flat)
         held = LinearizedView(gaussians, view.camera, loss, BACKGROUND, RenderSettings())
-        own, coarse = (held.block_diagonal(gauss_newton=part, approximate=True) for part in (False, True))
+        own, coarse = (held.block_diagonals(approximate=True, parts=(part,))[0] for part in (False, True))
         u = U.to(gaussians.flat)
         found = [held.image, held.gradient, held.jvp(u), held.vjp(G.to(u)), held.hvp(u), held.ggn(u)]
         found += [own.geometry, own.sh, coarse.geometry, coarse.sh, *held.loss_curvatures(u)]
