@@ -17,6 +17,7 @@ from splat.backend.cpu.memory import (
     PIXEL_ROWS,
     gather,
     load_pixels,
+    neighbouring_products,
     neighbours,
     pixel_columns,
     pixel_rows,
@@ -122,6 +123,8 @@ def test_every_operation_is_that_of_numpy_to_the_last_bit(dtype):
     fused = (5, 13)  # rounded once fewer than by NumPy; their terms are below 4
     for i, (got, want) in enumerate(zip(out.reshape(OPERATIONS, L), expected, strict=True)):
         assert got == pytest.approx(want, rel=0, abs=4 * float(np.finfo(dtype).eps) if i in fused else 0), i
+    # a fetch changes no number, but stays in the code
+    assert all("llvm.prefetch" in code for code in every_operation.inspect_llvm().values())
 
 
 @each_dtype
@@ -192,18 +195,20 @@ def test_rows_go_into_lanes_and_back_and_no_further(dtype, k, n):
 
 
 @numba.njit
-def all_around(a, at, out):
-    found = neighbours(a, at)
+def all_around(a, at, b, place, out):
+    found, products = neighbours(a, at), neighbouring_products(a, at, b, place)
     for j in range(10):
         store(out, j * lanes(a), found[j])
+        store(out, (10 + j) * lanes(a), products[j])
 
 
 @each_dtype
 def test_neighbours_are_those_to_the_right_then_those_to_the_left(dtype):
     L = lanes_of(dtype)
-    a, out, at = np.arange(16 * L, dtype=dtype), np.empty(10 * L, dtype), 8 * L
-    all_around(a, at, out)
-    assert (out.reshape(10, L) == at + np.arange(L) + np.array([[1, 2, 3, 4, 5, -1, -2, -3, -4, -5]]).T).all()
+    a, b, at, place = np.arange(16 * L, dtype=dtype), np.sqrt(np.arange(64, dtype=dtype)), 8 * L, 21
+    out, near = np.empty((20, L), dtype), np.arange(L) + np.array([[1, 2, 3, 4, 5, -1, -2, -3, -4, -5]]).T
+    all_around(a, at, b, place, out.reshape(-1))
+    assert (out[:10] == at + near).all() and (out[10:] == a[at + near] * b[place + near]).all()
 
 
 @numba.njit
