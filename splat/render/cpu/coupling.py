@@ -50,7 +50,7 @@ from splat.render.cpu.tile import ACROSS, ALONG, PARAMS, STEP, column_u, column_
 BLURRED = 4 * 3  # along a row, for each of three f: f D with the powers 0, 1, 2 of a t, and f w
 SLOPES = 7  # of a channel in a splat's numbers, in the order of its block: six of geometry, one of colour
 PAIRS = SLOPES * (SLOPES + 1) // 2
-MARGIN = 48  # zeros between rows of fields: at least 2 lanes - 1 and REACH
+MARGIN = 48  # zeros between rows of fields: at least 2 lanes - 1 + REACH, which a blur reads beyond the box
 AHEAD = 3  # rows of windows between a prefetch and its use; of a footprint twice as many vectors
 FLUSH = 16  # rows
 TAPS = tuple(float(tap) for tap in window(torch.float64)[REACH:])
@@ -86,7 +86,7 @@ def coupled_blocks(counter, order, index, params, frame, footprints, factors, se
 def fill_fields(splat, frame, footprints, fields, spans, weights, L):
     """Write w and D of a splat row by row, 0 where it has no weight, and the columns of each row that has to spans.
 
-    Returns the place of pixel (0, 0), the numbers from a field to the next, and the first and last row with weight.
+    Returns the place of pixel (0, 0)'s w, the numbers from a field to the next, and the first and last row with weight.
     weights: space for a vector.
     """
     layout, begin, values = footprints
