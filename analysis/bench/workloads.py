@@ -137,7 +137,7 @@ class ViewBench:
         camera, settings = self.view.camera, self.workload.settings
         return self.backend.rasterize(*found, self.background, camera.width, camera.height, settings)
 
-    def _linearize(self) -> Any:
+    def _linearize(self) -> LinearizedView:
         w = self.workload
         return LinearizedView(w.gaussians, self.view.camera, self.loss, self.background, w.settings)
 
@@ -159,6 +159,7 @@ class ViewBench:
     def calls(self) -> Calls:
         """All that is timed."""
         products = {f"H v {K}": lambda U=U: self.linearized.hvp(U) for K, U in self.vectors.items()}
+        exact = {"exact blocks": lambda: self.linearized.block_diagonals(parts=(False,))}
         return {
             "rasterizer": lambda: self._rasterize(self.projected).backward(self.cotangent),
             "gradient": self.gradient,
@@ -167,7 +168,7 @@ class ViewBench:
             **products,
             "block diagonal": self._block_diagonal,
             **({"gradient, atomic": lambda: self.gradient_by_autograd("atomic")} if self.backend is not CPU else {}),
-            **({"exact blocks": self.linearized.block_diagonal} if self.backend.exact_blocks else {}),
+            **(exact if self.backend.exact_blocks else {}),
         }
 
     def _block_diagonal(self) -> PerGaussianBlocks:

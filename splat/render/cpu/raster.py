@@ -159,13 +159,12 @@ class CpuRaster:
             size = int(layout.place[end] - layout.place[begin]) * row
             if not space or space[0].size < size:
                 space[:] = [aligned((max(size, most * row),), self.dtype)]  # pages count once they are written
-            values = space[0]
             view = (self.params, lists, self.frame, self.pixels)
-            over_tiles(footprints.find_footprints, *view, layout, begin, end, values)
+            over_tiles(footprints.find_footprints, *view, layout, begin, end, space[0])
             # neighbours one after the other: the pixels under them stay in the cache
             order = start + np.argsort(layout.tiles[splat_start[splats[start:stop]]], kind="stable")
             over_tiles(
-                coupling.coupled_blocks, order, splats, self.params, self.frame, (layout, begin, values), *coupled[:3],
+                coupling.coupled_blocks, order, splats, self.params, self.frame, (layout, begin, space[0]), *coupled[:3],
                 blocks,
             )  # fmt: skip
             start = stop
