@@ -89,8 +89,8 @@ def gradient_ratio(objective: SceneObjective) -> float:
 
 def _components(objective: SceneObjective) -> Float64[Tensor, "pairs 2"]:
     """`along_and_across` of the positions' gradient in every view."""
-    gradients = [view.gradient[objective.blocks["means"]].view(-1, 3) for view in objective.linearized]
-    parts = [along_and_across(gradient, objective.rays(index)) for index, gradient in enumerate(gradients)]
+    rows, views = objective.blocks["means"], enumerate(objective.linearized)
+    parts = [along_and_across(view.gradient[rows].view(-1, 3), objective.rays(index)) for index, view in views]
     return torch.stack(parts, dim=1).flatten(0, 1)
 
 
