@@ -129,15 +129,14 @@ def depth_split(
 
     settings: as for `exact_traces`, for either trace.  exact: sums over exact blocks in place of samples, on a CPU.
     """
-    rays = [objective.rays(index) for index in range(len(objective.views))]
     pairs = _components(objective)
-    whole, pixelwise = (objective.exact_blocks, None) if exact else objective.approximate_blocks
+    whole, pixelwise = objective.known_blocks(exact=exact)
     counts, n = (settings.min_probes, settings.max_probes), len(objective.active)
     traces = [
         SampledTrace(kind, dim, _mean(whole, kind), pixelwise and _mean(pixelwise, kind), settings, *counts)
         for kind, dim in zip(KINDS, (n, LATERAL_DIRECTIONS * n), strict=True)
     ]
-    estimates = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
+    estimates = sampled_traces(objective, generator, partial(_signs, objective), traces, progress)
     return DepthSplit(pairs[pairs.any(dim=1)], **estimates)
 
 
@@ -197,14 +196,10 @@ def _mean(blocks: PerGaussianBlocks, kind: str) -> float:
 
 
 def _signs(
-    objective: SceneObjective,
-    rays: Sequence[Float[Tensor, "n 3"]],
-    index: int,
-    generators: Sequence[torch.Generator],
-    names: Sequence[str],
+    objective: SceneObjective, index: int, generators: Sequence[torch.Generator], names: Sequence[str]
 ) -> Float[Tensor, "p b s"]:
     """Probe vectors: random signs along the rays; random signs in space, projected across the rays (`traces.Draw`)."""
-    flat, ray = objective.active.flat, rays[index]
+    flat, ray = objective.active.flat, objective.rays(index)
     U = flat.new_zeros(flat.numel(), len(names), len(generators))
     for j, generator in enumerate(generators):
         z = draw_probes(4 * len(ray), 1, generator, flat.dtype, "rademacher").view(-1, 4).to(ray)

@@ -209,8 +209,7 @@ def _ends(at: _Point, generator: torch.Generator, report: Progress, notes: list[
             f"the search for extreme eigenvalues kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB "
             "and half of what was free"
         )
-    blocks, pixelwise = (at.objective.exact_blocks, None) if at.exact_blocks else at.objective.approximate_blocks
-    start = BlockEigenvectors(at.objective, blocks, pixelwise).warm_start()
+    start = BlockEigenvectors(at.objective, *at.objective.known_blocks(exact=at.exact_blocks)).warm_start()
     eigen = replace(eigen, basis=basis)
     lifted = LiftedOperator(at.operator, at.hessian.project, spawn(generator))
     found = extreme_eigenpairs(lifted, generator, eigen, start, report)

@@ -167,16 +167,15 @@ def measure(objective: SceneObjective, generator: torch.Generator, settings: Tra
     streams = [spawn(generator) for _ in range(3)]
     hessian, whole = SceneHessian(objective), not settings.quick
     operator = CountingOperator(hessian)
-    if whole and objective.active.flat.device.type == "cpu":
+    exact = whole and objective.active.flat.device.type == "cpu"
+    if exact:
         traces = block_traces(objective)
-        blocks, pixelwise = objective.exact_blocks, None
     else:
         traces = exact_traces(objective, streams[0], settings.traces, samples=None if whole else LEAST_SAMPLES)
-        blocks, pixelwise = objective.approximate_blocks
     eigen = settings.eigen
     if not whole:
         eigen = replace(eigen, rtol=max(eigen.rtol, 0.1), max_matvecs=min(eigen.max_matvecs, COARSE_MATVECS))
-    leads = BlockEigenvectors(objective, blocks, pixelwise).warm_start()
+    leads = BlockEigenvectors(objective, *objective.known_blocks(exact=exact)).warm_start()
     lifted = LiftedOperator(operator, hessian.project, spawn(streams[1]))  # as in a probe
     ends = extreme_eigenpairs(lifted, streams[1], eigen, leads)
     density = None

@@ -227,8 +227,10 @@ class SceneObjective:
         space = []
         for done, view in enumerate(self.linearized, start=1):
             found = view.block_diagonals(approximate=approximate, parts=parts, space=space)
-            quats, rays = self.active.quats, self.rays(done - 1)
-            traces.append([each.traces(quats) | each.by_rays(rays) if traced else {} for each in found])
+            rays = self.rays(done - 1) if traced else None
+            traces.append(
+                [{} if rays is None else each.traces(self.active.quats) | each.by_rays(rays) for each in found]
+            )
             if done == 1:
                 totals = found
             else:
@@ -256,6 +258,10 @@ class SceneObjective:
     def approximate_blocks(self) -> tuple[PerGaussianBlocks, PerGaussianBlocks | None]:
         """The approximate blocks of the Hessian and, where the loss couples pixels, `pixelwise_blocks`."""
         return self.block_diagonal(approximate=True), self.pixelwise_blocks if self.couples_pixels else None
+
+    def known_blocks(self, *, exact: bool) -> tuple[PerGaussianBlocks, PerGaussianBlocks | None]:
+        """`exact_blocks`, which leave nothing to sample, or `approximate_blocks`."""
+        return (self.exact_blocks, None) if exact else self.approximate_blocks
 
     @cached_property
     def pixelwise_blocks(self) -> PerGaussianBlocks:

@@ -176,7 +176,7 @@ def _neighbours(dtype, addresses):
 
 @intrinsic
 def neighbours(typing, array, at):
-    many, generate = _neighbours(array.dtype, lambda *call: [address_of(*call)])
+    many, generate = _neighbours(array.dtype, lambda *known: [address_of(*known)])
     return many(array, at), generate
 
 

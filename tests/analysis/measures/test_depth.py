@@ -108,7 +108,7 @@ def test_steps_are_along_the_rays_or_across_them_and_as_long_as_a_pixel(objectiv
 def test_probes_have_signs_along_the_rays_or_across_them(objective):
     rays = [objective.rays(index) for index in range(2)]
     for index, ray in enumerate(rays):
-        U = _signs(objective, rays, index, [generator(0), generator(1)], KINDS)
+        U = _signs(objective, index, [generator(0), generator(1)], KINDS)
         means, others = U[objective.blocks["means"]].view(-1, 3, 2, 2), U[objective.blocks["means"].stop :]
         along = torch.einsum("nc,ncks->nks", ray, means)
         assert torch.allclose(along[:, 0].abs(), torch.ones(()).double()) and float(along[:, 1].abs().max()) < 1e-12

@@ -66,7 +66,7 @@ def launch_all(n: int, m: int, K: int, size: tuple[int, int] = (30, 22)) -> None
     for render in (ordered, atomic):
         held = LinearizedView(gaussians, view.camera, loss, BACKGROUND.float(), render)
         held.hvp(flat.new_ones(len(flat), K))
-        _ = held.gradient, held.block_diagonals(approximate=True)[0], held.loss_curvatures(flat.new_ones(len(flat), K))
+        _ = held.gradient, held.block_diagonals(approximate=True), held.loss_curvatures(flat.new_ones(len(flat), K))
     loss_and_gradient(gaussians, view.camera, loss, BACKGROUND.float(), atomic)
     loss.value(view.image)
     CudaImageLoss(view.image, settings).consistency(view.image, view.image)
